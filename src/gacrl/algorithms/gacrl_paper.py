@@ -1,0 +1,433 @@
+"""GACRL exactly as the paper prints it: equations (2) to (20), read as docs/algorithm.md says.
+
+Top to bottom: the networks (2)–(12), how agents act (9)–(16), the loss (17)–(20), one update.
+Equation (1) is in `envs.shaping`, the encoder (2)–(3) in `networks.encoder`, the graph (4) and (7) in
+`networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in `exploration`.
+"""
+
+from math import prod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.algorithms import replay as ring
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.algorithms.exploration import (
+    Coverage,
+    Schedule,
+    adaptive_level,
+    follow_coverage,
+    linear_decay,
+    no_coverage,
+)
+from gacrl.config import GacrlPaperConfig
+from gacrl.envs.environment import Environment
+from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
+from gacrl.networks.graph import neighbour_sum, observed_adjacency
+from gacrl.networks.layers import Linear
+from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, transmit
+from gacrl.types import (
+    Channel,
+    Decision,
+    Memory,
+    Metrics,
+    Observation,
+    Policy,
+    PRNGKey,
+    Rollout,
+    Transition,
+)
+
+
+class MessageModel(eqx.Module):
+    """Equations (5) to (9) without the sampling: one round of message passing over the graph."""
+
+    w1: Linear
+    w2: Linear
+    w3: Linear
+    w4: Linear
+
+    def __init__(self, latent_size: int, hidden_size: int, vocabulary: int, key: PRNGKey):
+        k1, k2, k3, k4 = jax.random.split(key, 4)
+        self.w1 = Linear(latent_size, hidden_size, k1)
+        self.w2 = Linear(hidden_size, vocabulary, k2)
+        self.w3 = Linear(hidden_size + vocabulary, hidden_size, k3)
+        self.w4 = Linear(hidden_size, vocabulary, k4)
+
+    def __call__(
+        self, latent: Float[Array, "Z N"], adjacency: Bool[Array, "N N"], channel: Channel
+    ) -> Float[Array, "V N"]:
+        """Returns the logits of each agent's outgoing symbol."""
+        h1 = jax.nn.relu(self.w1(latent, axis=0))  # (5)
+        m = self.w2(h1, axis=0)  # (6)
+        m_sum = neighbour_sum(m, adjacency, channel)  # (7)
+        h2 = jax.nn.relu(self.w3(jnp.concatenate([h1, m_sum]), axis=0))  # (8)
+        return self.w4(h2, axis=0)
+
+
+class PolicyNetwork(eqx.Module):
+    """Equation (11), with the hidden layer that W6 ∈ R^{5×32} needs: input-64-32-5."""
+
+    w5: Linear
+    hidden: Linear
+    w6: Linear
+
+    def __init__(self, in_size: int, hidden_sizes: tuple[int, int], num_actions: int, key: PRNGKey):
+        k5, k_hidden, k6 = jax.random.split(key, 3)
+        self.w5 = Linear(in_size, hidden_sizes[0], k5)
+        self.hidden = Linear(hidden_sizes[0], hidden_sizes[1], k_hidden)
+        self.w6 = Linear(hidden_sizes[1], num_actions, k6)
+
+    def __call__(self, x: Float[Array, "X N"]) -> Float[Array, "A N"]:
+        """Returns the logits of the actions."""
+        hidden = jax.nn.relu(self.hidden(jax.nn.relu(self.w5(x, axis=0)), axis=0))
+        return self.w6(hidden, axis=0)
+
+
+class Critic(eqx.Module):
+    """Equation (12), with the hidden layer that W8 ∈ R^{1×64} needs: input-128-64-1."""
+
+    w7: Linear
+    hidden: Linear
+    w8: Linear
+
+    def __init__(self, in_size: int, hidden_sizes: tuple[int, int], key: PRNGKey):
+        k7, k_hidden, k8 = jax.random.split(key, 3)
+        self.w7 = Linear(in_size, hidden_sizes[0], k7)
+        self.hidden = Linear(hidden_sizes[0], hidden_sizes[1], k_hidden)
+        self.w8 = Linear(hidden_sizes[1], 1, k8)
+
+    def __call__(self, features: Float[Array, "N O"]) -> Float[Array, ""]:
+        """V(s) of the global state s = [o_1, …, o_N]."""
+        s = features.reshape(-1)
+        hidden = jax.nn.relu(self.hidden(jax.nn.relu(self.w7(s, axis=0)), axis=0))
+        return self.w8(hidden, axis=0)[0]
+
+
+class Network(eqx.Module):
+    encoder: Encoder
+    message_model: MessageModel
+    policy: PolicyNetwork
+    critic: Critic
+
+
+class Noise(NamedTuple):
+    """What a forward pass draws: ε of (3), and the Gumbel noise of (9)."""
+
+    latent: Float[Array, "Z N *b"]
+    gumbel: Float[Array, "V N *b"]
+
+
+class Forward(NamedTuple):
+    """What one forward pass over one environment's agents computes, a column for each agent."""
+
+    logits: Float[Array, "A N *b"]
+    message: Float[Array, "V N *b"]
+    mean: Float[Array, "Z N *b"]
+    log_variance: Float[Array, "Z N *b"]
+
+
+def forward(
+    network: Network,
+    features: Float[Array, "N O"],
+    adjacency: Bool[Array, "N N"],
+    temperature: Float[Array, ""],
+    noise: Noise | None,
+    straight_through: bool = False,
+    channel: Channel | None = None,
+    key: PRNGKey | None = None,
+    memory: Memory = (),
+) -> tuple[Forward, Memory]:
+    """Observations to action logits, equations (2) to (11), for the N agents of one environment.
+
+    Agents stand in columns, as the paper's W z_i + b has them; `Linear` says why that is also fast.
+    Without noise: the mean latent and each agent's most likely symbol (evaluation).
+    """
+    channel = Channel() if channel is None else channel
+    o = features.T
+    mean, log_variance = network.encoder(o, axis=0)  # (2)
+    z = mean if noise is None else sample_latent(mean, log_variance, noise.latent)  # (3)
+    symbol_logits = network.message_model(z, adjacency, channel)  # (5)-(8)
+    if noise is None:
+        message = most_likely_symbol(symbol_logits, axis=0)
+    else:
+        message = gumbel_softmax(symbol_logits, noise.gumbel, temperature, straight_through, axis=0)  # (9)
+    received, memory = transmit(message, channel, key, memory)
+    x = jnp.concatenate([o, others_side_by_side(received), z])  # (10)
+    return Forward(network.policy(x), message, mean, log_variance), memory  # (11)
+
+
+def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*V N"]:
+    """The messages part of equation (10): concat([m_j | j ≠ i]), j ascending, whoever is near.
+
+    received: entry [:, i, j] is j's message as it reaches i.
+    """
+    num_agents = received.shape[1]
+    if num_agents == 1:
+        return jnp.zeros((0, 1))
+    # Slot k holds agent k for those after it and agent k + 1 for the others.
+    slots = [
+        jnp.stack([received[:, i, k + (k >= i)] for i in range(num_agents)], axis=1)
+        for k in range(num_agents - 1)
+    ]
+    return jnp.concatenate(slots)
+
+
+def behaviour_probabilities(logits: Float[Array, "*b A"], epsilon: Float[Array, ""]) -> Float[Array, "*b A"]:
+    """What the agents act by: with probability ε uniformly, else by the policy of (11)."""
+    return (1 - epsilon) * jax.nn.softmax(logits) + epsilon / logits.shape[-1]
+
+
+class Experience(NamedTuple):
+    """What the replay remembers of a step; latents and messages are recomputed from it."""
+
+    features: Float[Array, "*b N O"]
+    adjacency: Bool[Array, "*b N N"]
+    action: Int[Array, "*b N"]
+    reward: Float[Array, "*b"]
+    """The team's reward as it was when earned: θ and the local ratio have moved on since."""
+
+
+class Hyper(NamedTuple):
+    """Table I and what stands in the equations, as numbers that a sweep can vary."""
+
+    learning_rate: Float[Array, ""] | float
+    learning_rate_end: Float[Array, ""] | float
+    epsilon: Schedule
+    temperature: Schedule
+    num_episodes: Float[Array, ""] | float
+    radius: Float[Array, ""] | float
+    critic_weight: Float[Array, ""] | float
+    kl_weight: Float[Array, ""] | float
+
+
+class LearnerState(NamedTuple):
+    network: Network
+    optimizer: optax.OptState
+    replay: ring.Replay[Experience]
+    coverage: Coverage
+    hyper: Hyper
+
+
+def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) -> Float[Array, "N *b"]:
+    """log π of the actions taken, by equation (11) alone: ε is not part of it."""
+    taken = jax.nn.one_hot(action, logits.shape[0], axis=0)
+    return (jax.nn.log_softmax(logits, axis=0) * taken).sum(0)
+
+
+def policy_loss(
+    log_probability: Float[Array, "N B+1"], reward: Float[Array, "B+1"], batch_size: int
+) -> Float[Array, ""]:
+    """Equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
+
+    The weight is the immediate reward, as printed: no return, no baseline, no importance ratio.
+    """
+    weighted = -log_probability.mean(0) * reward
+    return weighted[:batch_size].mean() + weighted[batch_size:].sum()
+
+
+def critic_loss(value: Float[Array, " B"], reward: Float[Array, " B"]) -> Float[Array, ""]:
+    """Equation (19): the critic regresses the immediate reward."""
+    return jnp.square(value - reward).mean()
+
+
+def kl_loss(
+    mean: Float[Array, "Z N B"], log_variance: Float[Array, "Z N B"], mean_over_latent: bool = False
+) -> Float[Array, ""]:
+    """Equation (20): without the ½, summed over the latent dimensions, averaged over agents and batch."""
+    loss = 2.0 * kl_divergence(mean, log_variance, axis=0).mean()
+    return loss / mean.shape[0] if mean_over_latent else loss
+
+
+def loss(
+    network: Network,
+    hyper: Hyper,
+    rows: Experience,
+    temperature: Float[Array, ""],
+    noise: Noise,
+    config: GacrlPaperConfig,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Equation (17) on B replayed rows and, as the last row, the current step.
+
+    Latents, messages and log-probabilities are recomputed with the current weights and temperature.
+    Returns the loss and its three parts.
+    """
+    batch_size = config.batch_size
+    straight_through = config.messages == "straight_through"
+    columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), rows)
+    output = jax.vmap(
+        lambda row, noise: forward(
+            network, row.features, row.adjacency, temperature, noise, straight_through
+        )[0],
+        in_axes=-1,
+        out_axes=-1,
+    )(columns, noise)
+    value = jax.vmap(network.critic, in_axes=-1)(columns.features[..., :batch_size])
+    parts = {
+        "loss_policy": policy_loss(
+            log_probability(output.logits, columns.action), rows.reward, batch_size
+        ),
+        "loss_critic": critic_loss(value, rows.reward[:batch_size]),
+        "loss_kl": kl_loss(
+            output.mean[..., :batch_size],
+            output.log_variance[..., :batch_size],
+            mean_over_latent=config.kl_reduction == "mean",
+        ),
+    }
+    total = (
+        parts["loss_policy"]
+        + hyper.critic_weight * parts["loss_critic"]
+        + hyper.kl_weight * parts["loss_kl"]
+    )
+    return total, parts
+
+
+def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
+    """The paper's algorithm for this task's shapes. Needs discrete actions."""
+    num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
+    straight_through = config.messages == "straight_through"
+    adam = optax.scale_by_adam()
+    hyper = Hyper(
+        learning_rate=config.learning_rate,
+        learning_rate_end=config.learning_rate_end,
+        epsilon=Schedule(config.epsilon, config.epsilon_end, config.epsilon_bonus),
+        temperature=Schedule(config.temperature, config.temperature_end, config.temperature_bonus),
+        num_episodes=config.schedule_episodes,
+        radius=config.radius,
+        critic_weight=config.critic_weight,
+        kl_weight=config.kl_weight,
+    )
+
+    def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
+        encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
+        policy_input = observation_size + config.vocabulary * (num_agents - 1) + config.latent_size
+        network = Network(
+            Encoder(observation_size, config.encoder_hidden, config.latent_size, encoder_key),
+            MessageModel(config.latent_size, config.message_hidden, config.vocabulary, message_key),
+            PolicyNetwork(policy_input, config.policy_hidden, num_actions, policy_key),
+            Critic(observation_size * num_agents, config.critic_hidden, critic_key),
+        )
+        blank = Experience(
+            features=jnp.zeros((num_agents, observation_size)),
+            adjacency=jnp.zeros((num_agents, num_agents), bool),
+            action=jnp.zeros(num_agents, jnp.int32),
+            reward=jnp.zeros(()),
+        )
+        return LearnerState(
+            network=network,
+            optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
+            replay=ring.empty(blank, config.replay_capacity),
+            coverage=no_coverage(),
+            hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
+        )
+
+    def levels(learner: LearnerState) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """ε and τ of the moment, equations (13) to (16)."""
+        hyper, episode = learner.hyper, learner.coverage.episode
+        coverage = learner.coverage.signal(config.coverage_signal)
+        return (
+            adaptive_level(hyper.epsilon, episode, hyper.num_episodes, coverage),
+            adaptive_level(hyper.temperature, episode, hyper.num_episodes, coverage),
+        )
+
+    def draw_noise(key: PRNGKey, *batch: int) -> Noise:
+        latent_key, gumbel_key = jax.random.split(key)
+        latent_shape = (config.latent_size, num_agents, *batch)
+        gumbel_shape = (config.vocabulary, num_agents, *batch)
+        # Drawn flat: the counter-based generator is several times slower on many axes.
+        return Noise(
+            jax.random.normal(latent_key, (prod(latent_shape),)).reshape(latent_shape),
+            jax.random.gumbel(gumbel_key, (prod(gumbel_shape),)).reshape(gumbel_shape),
+        )
+
+    def policy(learner: LearnerState, explore: bool) -> Policy:
+        epsilon, temperature = levels(learner)
+
+        def act(
+            memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
+        ) -> tuple[Decision, Memory]:
+            noise_key, action_key, channel_key = jax.random.split(key, 3)
+            noise = draw_noise(noise_key) if explore else None
+            adjacency = observed_adjacency(observation, learner.hyper.radius)
+            output, memory = forward(
+                learner.network,
+                observation.features,
+                adjacency,
+                temperature,
+                noise,
+                straight_through,
+                channel,
+                channel_key,
+                memory,
+            )
+            logits = jnp.where(observation.action_mask, output.logits.T, -jnp.inf)
+            if explore:
+                probabilities = behaviour_probabilities(logits, epsilon)
+                action = jax.random.categorical(action_key, jnp.log(probabilities))
+            else:
+                action = logits.argmax(-1)
+            extras = {"value": learner.network.critic(observation.features)}
+            if noise is not None:
+                extras["noise"] = noise
+            return Decision(action, output.message.T, adjacency, extras), memory
+
+        return act
+
+    def learn_from_step(
+        learner: LearnerState, step: Transition, key: PRNGKey
+    ) -> tuple[LearnerState, Metrics]:
+        """Remember one step of one environment, then take one gradient step of Adam."""
+        sample_key, noise_key = jax.random.split(key)
+        epsilon, temperature = levels(learner)
+        current = Experience(
+            step.observation.features,
+            step.decision.adjacency,  # pyright: ignore[reportArgumentType] this policy always sets it
+            step.decision.action,
+            step.reward.mean(),
+        )
+        replay = ring.add(learner.replay, current)
+        batch = ring.sample(replay, sample_key, config.batch_size)
+        rows = jax.tree.map(lambda past, now: jnp.concatenate([past, now[None]]), batch, current)
+        noise = jax.tree.map(
+            lambda fresh, acted: jnp.concatenate([fresh, acted[..., None]], axis=-1),
+            draw_noise(noise_key, config.batch_size),
+            step.decision.extras["noise"],
+        )
+        gradients, losses = jax.grad(loss, has_aux=True)(
+            learner.network, learner.hyper, rows, temperature, noise, config
+        )
+        directions, optimizer = adam.update(gradients, learner.optimizer)
+        hyper = learner.hyper
+        learning_rate = linear_decay(
+            hyper.learning_rate, hyper.learning_rate_end, learner.coverage.episode, hyper.num_episodes
+        )
+        network = jax.tree.map(lambda w, d: w - learning_rate * d, learner.network, directions)
+        coverage = step.info.get("coverage_theta", jnp.zeros(()))
+        done = step.terminated | step.truncated
+        learner = learner._replace(
+            network=network,
+            optimizer=optimizer,
+            replay=replay,
+            coverage=follow_coverage(learner.coverage, coverage[None], done[None]),
+        )
+        return learner, {**losses, "epsilon": epsilon, "temperature": temperature}
+
+    def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+        """One gradient step per environment step, in the order in which they were taken."""
+        time, environments = rollout.transitions.reward.shape[:2]
+        steps = jax.tree.map(
+            lambda leaf: leaf.reshape(time * environments, *leaf.shape[2:]), rollout.transitions
+        )
+        if time * environments == 1:
+            return learn_from_step(learner, jax.tree.map(lambda leaf: leaf[0], steps), key)
+        keys = jax.random.split(key, time * environments)
+        learner, metrics = jax.lax.scan(
+            lambda learner, inputs: learn_from_step(learner, *inputs), learner, (steps, keys)
+        )
+        return learner, jax.tree.map(lambda values: values.mean(0), metrics)
+
+    return Algorithm(init, lambda num_agents: (), policy, update, hyper)

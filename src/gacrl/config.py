@@ -1,0 +1,384 @@
+"""The settings of a run: one frozen dataclass per part, the presets, and how they load and save.
+
+A leaf: it imports no jax, so that `--help` and reports start at once. Every default has its home here.
+"""
+
+import dataclasses
+import difflib
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be: one sentence that names the thing and the mend."""
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ConfigError(message)
+
+
+def _between(section: str, settings: object, low: float, high: float, *names: str) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None:
+            _require(
+                isinstance(value, int | float) and low <= value <= high,
+                f"{section}.{name} must be between {low:g} and {high:g}, not {value}",
+            )
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The task."""
+
+    name: Literal["spread"] = "spread"
+    """Which task."""
+    num_agents: int = 3
+    """Agents."""
+    num_landmarks: int | None = None
+    """Landmarks; none: as many as agents."""
+    max_cycles: int = 25
+    """Steps of an episode."""
+    local_ratio: float = 0.5
+    """Weight of an agent's own collisions in its reward; the shared distance has the rest."""
+    continuous_actions: bool = False
+    """Five pushes in [0, 1] an agent, instead of one of five actions."""
+    num_agent_neighbors: int | None = None
+    """Agents see only this many nearest others; none: all."""
+    num_landmark_neighbors: int | None = None
+    """Agents see only this many nearest landmarks; none: all."""
+    terminate_on_success: bool = False
+    """End the episode when every landmark is covered."""
+    arena_scale: float = 1.0
+    """Starts are uniform in [-scale, scale] squared."""
+    landmark_speed: float = 0.0
+    """Speed of the landmarks, as a share of an agent's top speed."""
+    coverage_threshold: float = 0.5
+    """θ of the paper: its coverage bonus, and the coverage that exploration follows."""
+    reward: Literal["mpe2", "paper"] = "mpe2"
+    """What the learner earns: MPE2's reward, or the paper's shaped one, equation (1)."""
+    collision_term: Literal["per_agent", "once"] = "per_agent"
+    """Equation (1)'s collision term inside the sum over agents, or once."""
+    collision_distance: float = 0.2
+    """Equation (1)'s collision distance; the discs touch at 0.3."""
+    reset_on_collision: Literal["off", "truncate", "in_place"] = "off"
+    """The paper's "resets if agents collide": never, as an episode's end, or new places mid-episode."""
+    reset_distance: float = 0.2
+    """Agents this close have collided, for reset_on_collision."""
+
+    def __post_init__(self) -> None:
+        _between("env", self, 1, 10_000, "num_agents", "num_landmarks")
+        _between("env", self, 1, 1_000_000, "max_cycles")
+        _between("env", self, 1, 10_000, "num_agent_neighbors", "num_landmark_neighbors")
+        _between("env", self, 0.0, 1.0, "local_ratio")
+        _between("env", self, 0.001, 1000.0, "arena_scale", "coverage_threshold")
+        _between("env", self, 0.0, 10.0, "landmark_speed", "collision_distance", "reset_distance")
+
+    @property
+    def landmarks(self) -> int:
+        return self.num_agents if self.num_landmarks is None else self.num_landmarks
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """How the task changes while training: linearly over episodes, from its value in env to the value here."""
+
+    local_ratio_end: float | None = None
+    """Local ratio after the last episode; none: constant."""
+    coverage_threshold_end: float | None = None
+    """θ after the last episode; none: constant."""
+    episodes: int = 1500
+    """Episodes that the change takes."""
+
+    def __post_init__(self) -> None:
+        _between("curriculum", self, 0.0, 1.0, "local_ratio_end")
+        _between("curriculum", self, 0.001, 1000.0, "coverage_threshold_end")
+        _between("curriculum", self, 1, 1e9, "episodes")
+
+
+@dataclass(frozen=True)
+class GacrlPaperConfig:
+    """The paper's algorithm, as printed (docs/algorithm.md)."""
+
+    name: ClassVar[str] = "gacrl_paper"
+
+    learning_rate: float = 5e-4
+    """Adam's step size at the start."""
+    learning_rate_end: float = 1e-4
+    """And at the end of the schedule."""
+    epsilon: float = 0.3
+    """Share of random actions at the start, equation (15)."""
+    epsilon_end: float = 0.1
+    epsilon_bonus: float = 0.2
+    """Added to epsilon at coverage 0, equation (13)."""
+    temperature: float = 2.0
+    """Gumbel-Softmax temperature at the start, equation (16)."""
+    temperature_end: float = 0.7
+    temperature_bonus: float = 0.5
+    """Added to the temperature at coverage 0, equation (14)."""
+    schedule_episodes: int = 1500
+    """Episodes over which learning rate, epsilon and temperature decay."""
+    coverage_signal: Literal["episode_so_far", "last_episode"] = "episode_so_far"
+    """c of (13) and (14): mean coverage of the episode so far, or of the last finished one."""
+    batch_size: int = 64
+    """Replayed steps in a gradient step, B."""
+    replay_capacity: int = 10_000
+    """Steps that the replay remembers."""
+    critic_weight: float = 0.1
+    """Weight of the critic's loss, equation (17)."""
+    kl_weight: float = 0.05
+    """Weight of the KL divergence, equation (17)."""
+    kl_reduction: Literal["sum", "mean"] = "sum"
+    """Equation (20) over the latent dimensions."""
+    messages: Literal["soft", "straight_through"] = "soft"
+    """Gumbel-Softmax samples as printed, or one-hot with the soft gradient."""
+    radius: float = 1.5
+    """Agents nearer than this share an edge, equation (4)."""
+    latent_size: int = 16
+    vocabulary: int = 8
+    """Symbols of a message."""
+    encoder_hidden: tuple[int, ...] = (64, 32)
+    message_hidden: int = 32
+    policy_hidden: tuple[int, int] = (64, 32)
+    critic_hidden: tuple[int, int] = (128, 64)
+
+    def __post_init__(self) -> None:
+        _between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "epsilon", "epsilon_end")
+        _between("algorithm", self, 0.0, 1.0, "epsilon_bonus")
+        _require(
+            max(self.epsilon, self.epsilon_end) + self.epsilon_bonus <= 1.0,
+            "algorithm.epsilon plus algorithm.epsilon_bonus must not exceed 1, a probability",
+        )
+        _between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
+        _between("algorithm", self, 0.0, 100.0, "temperature_bonus", "critic_weight", "kl_weight")
+        _between("algorithm", self, 0.0, 1e6, "radius")
+        _between("algorithm", self, 1, 1_000_000, "batch_size", "replay_capacity", "schedule_episodes")
+        _between("algorithm", self, 1, 100_000, "latent_size", "vocabulary", "message_hidden")
+        for name in ("encoder_hidden", "policy_hidden", "critic_hidden"):
+            sizes = getattr(self, name)
+            _require(
+                len(sizes) > 0 and all(1 <= size <= 100_000 for size in sizes),
+                f"algorithm.{name} must be layer sizes between 1 and 100000, not {list(sizes)}",
+            )
+
+
+AlgorithmConfig: TypeAlias = GacrlPaperConfig
+"""Any algorithm's settings; a union as soon as there are two."""
+
+ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType({GacrlPaperConfig.name: GacrlPaperConfig})
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How long, and how experience is gathered."""
+
+    env_steps: int = 112_500
+    """Environment steps of each seed; one step moves every agent of one environment once."""
+    num_envs: int = 1
+    """Environments side by side."""
+    num_steps: int = 1
+    """Steps of each environment between two updates."""
+
+    def __post_init__(self) -> None:
+        _between("training", self, 1, 1e12, "env_steps")
+        _between("training", self, 1, 1_000_000, "num_envs", "num_steps")
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Evaluation on fixed episodes that training never sees."""
+
+    interval: int = 3_750
+    """Environment steps between evaluations; also between checkpoints, and lines of the log."""
+    num_episodes: int = 32
+    """Episodes of each evaluation."""
+    final_episodes: int = 320
+    """Episodes of the evaluation that ends the run."""
+    horizon: int | None = None
+    """Steps of an evaluation episode; none: as in training."""
+
+    def __post_init__(self) -> None:
+        _between("evaluation", self, 1, 1e12, "interval")
+        _between("evaluation", self, 1, 100_000, "num_episodes", "final_episodes")
+        _between("evaluation", self, 1, 1_000_000, "horizon")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that determines a run."""
+
+    algorithm: AlgorithmConfig = field(default_factory=GacrlPaperConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    preset: str = "paper"
+    """The preset that this started from."""
+    seed: int = 0
+    """Seed of the first member."""
+    num_seeds: int = 1
+    """Members: independent runs with the seeds seed, seed + 1, …"""
+
+    def __post_init__(self) -> None:
+        _between("run", self, 0, 2**31 - 1, "seed")
+        _between("run", self, 1, 10_000, "num_seeds")
+        _require(
+            not (self.env.continuous_actions and isinstance(self.algorithm, GacrlPaperConfig)),
+            "the paper's GACRL needs discrete actions: leave env.continuous_actions at False",
+        )
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        return tuple(range(self.seed, self.seed + self.num_seeds))
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps that one update consumes."""
+        return self.training.num_envs * self.training.num_steps
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of the whole run; a started one is finished."""
+        return -(-self.training.env_steps // self.steps_per_update)
+
+    @property
+    def updates_per_chunk(self) -> int:
+        """Updates between two evaluations."""
+        return min(self.num_updates, -(-self.evaluation.interval // self.steps_per_update))
+
+
+_PAPER = RunConfig(
+    algorithm=GacrlPaperConfig(),
+    env=EnvConfig(max_cycles=75, reward="paper"),
+    curriculum=CurriculumConfig(local_ratio_end=0.1, coverage_threshold_end=0.2),
+    training=TrainingConfig(env_steps=112_500),
+    evaluation=EvaluationConfig(interval=50 * 75),
+    preset="paper",
+)
+
+PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
+    {
+        "paper": ("the paper's GACRL as printed: 1,500 episodes of 75 steps, an update every step", _PAPER),
+    }
+)
+DEFAULT_PRESET = "paper"
+
+
+def preset(name: str = DEFAULT_PRESET) -> RunConfig:
+    """The settings of a preset. Raises ConfigError with the nearest name for one there is not."""
+    if name not in PRESETS:
+        raise ConfigError(unknown("preset", name, PRESETS, "see `gacrl presets`"))
+    return PRESETS[name][1]
+
+
+def unknown(kind: str, name: str, known: Mapping[str, Any] | set[str] | list[str], hint: str = "") -> str:
+    """The sentence for a name that is not among the known ones, with the nearest of them."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
+    mend = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
+    return f"unknown {kind} '{name}': {mend}" + (f" ({hint})" if hint else "")
+
+
+def to_dict(config: RunConfig) -> dict[str, Any]:
+    """The settings as plain data, complete; the algorithm's name stands among its settings."""
+    data = dataclasses.asdict(config)
+    return {**data, "algorithm": {"name": config.algorithm.name, **data["algorithm"]}}
+
+
+def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConfig:
+    """Settings from plain data over a base (the preset that the data names, else the default one).
+
+    Raises ConfigError for an unknown key (with the nearest known one) or a value of the wrong type.
+    """
+    if base is None:
+        base = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
+    data = dict(data)
+    if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
+        settings = dict(data["algorithm"])
+        name = _text(settings.pop("name"), "algorithm.name")
+        if name not in ALGORITHMS:
+            raise ConfigError(unknown("algorithm", name, ALGORITHMS))
+        if name != base.algorithm.name:
+            base = dataclasses.replace(base, algorithm=ALGORITHMS[name]())
+        data["algorithm"] = settings
+    return _merge(base, data, "")
+
+
+def load(path: Path) -> RunConfig:
+    """Read settings from a JSON file (as `config.json` of a run folder, or a part of it)."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} must hold a JSON object of settings")
+    try:
+        return from_dict(data)  # pyright: ignore[reportUnknownArgumentType]
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def dumps(config: RunConfig) -> str:
+    """The settings as the text of a loadable file."""
+    return json.dumps(to_dict(config), indent=2) + "\n"
+
+
+def fingerprint(config: RunConfig) -> str:
+    """A hash of every setting: what a checkpoint belongs to."""
+    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str):
+        raise ConfigError(f"{where} must be a name, not {value!r}")
+    return value
+
+
+def _merge(settings: Any, data: Mapping[str, Any], where: str) -> Any:
+    """`settings`, a dataclass, with the values that `data` names."""
+    hints = get_type_hints(type(settings))
+    fields = {f.name for f in dataclasses.fields(settings)}
+    changes: dict[str, Any] = {}
+    for key, value in data.items():
+        if key not in fields:
+            raise ConfigError(unknown("setting", where + key, {where + name for name in fields}))
+        current = getattr(settings, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{where}{key} must be an object of settings, not {value!r}")
+            changes[key] = _merge(current, value, f"{where}{key}.")  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            changes[key] = _coerce(value, hints[key], where + key)
+    return dataclasses.replace(settings, **changes)
+
+
+def _coerce(value: Any, hint: Any, where: str) -> Any:
+    """The value as the type that the setting has; JSON has no tuples, and writes 1 for 1.0."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        _require(value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+        return value
+    if origin is tuple and isinstance(value, list | tuple):
+        inner = arguments[0]
+        values: list[Any] = list(value)  # pyright: ignore[reportUnknownArgumentType]
+        fixed = arguments[-1] is not Ellipsis
+        _require(
+            not fixed or len(values) == len(arguments),
+            f"{where} must be {len(arguments)} numbers, not {values!r}",
+        )
+        return tuple(_coerce(item, inner, where) for item in values)
+    if origin is not None and type(None) in arguments:  # X | None
+        return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
+    matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+    _require(matches, f"{where} must be {wanted}, not {value!r}")
+    return value

@@ -1,0 +1,354 @@
+"""`spread`: simple_spread_v3 of MPE2 1.1.1, step for step, for any number of agents and landmarks.
+
+N agents must stand on L landmarks without touching each other. Beyond MPE2: L ≠ N, an arena of any size,
+landmarks that move, padded agents, and the readings of the paper's "resets if agents collide".
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.envs.environment import TimeStep
+from gacrl.envs.particles import (
+    DIRECTIONS,
+    Physics,
+    action_forces,
+    contact_forces,
+    integrate,
+    pairwise_offsets,
+)
+from gacrl.envs.shaping import CollisionTerm, paper_shaped_reward
+from gacrl.types import Metrics, Observation, PRNGKey
+
+CAPTURE_RADIUS = 0.1
+"""MPE2's radius of a covered landmark."""
+COVERAGE_RADII = (0.1, 0.2, 0.5)
+NEAR_DISTANCE = 0.2
+"""The paper counts agents with a neighbour this close; their discs touch at 0.3."""
+REPORTED_LOCAL_RATIO = 0.5
+"""`reward_raw` is always taken at MPE2's default, whatever the learner is trained on."""
+
+RewardKind = Literal["mpe2", "paper"]
+CollisionReset = Literal["off", "truncate", "in_place"]
+
+
+class SpreadParams(NamedTuple):
+    """Everything about the task that is a number: change it between steps, nothing recompiles."""
+
+    physics: Physics = Physics()
+    local_ratio: Float[Array, ""] | float = 0.5
+    """Weight of an agent's own collisions; the shared distance has 1 − local_ratio."""
+    collision_penalty: Float[Array, ""] | float = 1.0
+    """0 is the first stage of MPE2's `curriculum`."""
+    coverage_threshold: Float[Array, ""] | float = 0.5
+    """θ of equation (1), of adaptive exploration and of the metric `coverage_theta`."""
+    arena_scale: Float[Array, ""] | float = 1.0
+    """Agents and landmarks start uniformly in [−arena_scale, arena_scale]²."""
+    landmark_speed: Float[Array, ""] | float = 0.0
+    """Speed of the landmarks, as a share of an agent's top speed."""
+    reset_distance: Float[Array, ""] | float = 0.2
+    """Agents this close count as collided for `reset_on_collision`."""
+    agent_mask: Bool[Array, " N"] | None = None
+    """False for padding; None: all agents are real, and nothing is spent on masks."""
+    landmark_mask: Bool[Array, " L"] | None = None
+
+
+class SpreadState(NamedTuple):
+    positions: Float[Array, "N 2"]
+    velocities: Float[Array, "N 2"]
+    landmarks: Float[Array, "L 2"]
+    landmark_velocities: Float[Array, "L 2"]
+    clock: Int[Array, ""]
+    """Steps taken in this episode."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The structure of the task: what shapes the compiled program. Numbers live in `SpreadParams`."""
+
+    num_agents: int = 3
+    num_landmarks: int = 3
+    max_cycles: int = 25
+    continuous_actions: bool = False
+    num_agent_neighbors: int | None = None
+    """Agents see only this many nearest others, nearest first, zero-padded; None: all, in order."""
+    num_landmark_neighbors: int | None = None
+    terminate_on_success: bool = False
+    """End the episode when every landmark has an agent within `CAPTURE_RADIUS`."""
+    reset_on_collision: CollisionReset = "off"
+    """`truncate` ends the episode, `in_place` draws new places while the episode's clock runs on."""
+    reward: RewardKind = "mpe2"
+    collision_term: CollisionTerm = "per_agent"
+    collision_distance: float = NEAR_DISTANCE
+    """Distance of the collision term in equation (1)."""
+    initial_params: SpreadParams = SpreadParams()
+
+    @property
+    def num_actions(self) -> int:
+        return len(DIRECTIONS)
+
+    @property
+    def seen_landmarks(self) -> int:
+        return self.num_landmarks if self.num_landmark_neighbors is None else self.num_landmark_neighbors
+
+    @property
+    def seen_agents(self) -> int:
+        return self.num_agents - 1 if self.num_agent_neighbors is None else self.num_agent_neighbors
+
+    @property
+    def observation_size(self) -> int:
+        """Velocity, position, landmarks, other agents, their silent channel of two numbers each."""
+        return 4 + 2 * self.seen_landmarks + 4 * self.seen_agents
+
+    def default_params(self) -> SpreadParams:
+        """`initial_params` as arrays, so that they are data to every compiled program."""
+        return jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, None if jnp.asarray(leaf).dtype == bool else float),
+            self.initial_params,
+        )
+
+    def reset(self, key: PRNGKey, params: SpreadParams | None = None) -> tuple[SpreadState, Observation]:
+        """Agents and landmarks uniform in the arena, agents at rest."""
+        params = self.default_params() if params is None else params
+        state = self._place(key, params)
+        return state, self.observe(state, params)
+
+    def step(
+        self, state: SpreadState, action: Array, key: PRNGKey, params: SpreadParams | None = None
+    ) -> tuple[SpreadState, TimeStep]:
+        """One step of the world. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
+        params = self.default_params() if params is None else params
+        state = self._move(state, action, params)
+        info = self.measure(state, params)
+        if self.reward == "paper":
+            reward = jnp.broadcast_to(info["reward_shaped"], (self.num_agents,))
+        else:
+            reward = self.rewards(state, params)
+        if params.agent_mask is not None:
+            reward = jnp.where(params.agent_mask, reward, 0.0)
+
+        truncated = state.clock >= self.max_cycles
+        terminated = jnp.zeros((), bool)
+        if self.terminate_on_success:
+            # MPE2 looks at the time limit first: success at the last step is a truncation there.
+            terminated = (info[f"success_{CAPTURE_RADIUS}"] == 1.0) & ~truncated
+        if self.reset_on_collision != "off":
+            distance = _nearest_agent(state.positions, params.agent_mask)
+            collided = (distance < params.reset_distance).any()
+            if self.reset_on_collision == "truncate":
+                truncated |= collided
+            else:
+                fresh = self._place(key, params)._replace(clock=state.clock)
+                state = jax.tree.map(lambda new, old: jnp.where(collided, new, old), fresh, state)
+        return state, TimeStep(self.observe(state, params), reward, terminated, truncated, info)
+
+    def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, " N"]:
+        """MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
+        _, to_landmarks = pairwise_offsets(state.positions, state.landmarks)
+        shared = -_masked(_over_agents(to_landmarks, params), params.landmark_mask).sum()
+        own = -params.collision_penalty * _touching(state.positions, params).sum(1)
+        return own * params.local_ratio + shared * (1 - params.local_ratio)
+
+    def observe(self, state: SpreadState, params: SpreadParams) -> Observation:
+        """What each agent sees, in MPE2's order, and the exact state for central critics and oracles."""
+        offsets, distance = pairwise_offsets(state.positions, state.landmarks)
+        landmarks = _nearest(offsets, distance, params.landmark_mask, self.num_landmark_neighbors)
+
+        others = _others(self.num_agents)
+        offsets, distance = pairwise_offsets(state.positions, state.positions)
+        offsets = jnp.take_along_axis(offsets, others[..., None], axis=1)
+        distance = jnp.take_along_axis(distance, others, axis=1)
+        mask = None if params.agent_mask is None else params.agent_mask[others]
+        agents = _nearest(offsets, distance, mask, self.num_agent_neighbors)
+
+        flat = (self.num_agents, -1)
+        silence = jnp.zeros((self.num_agents, 2 * self.seen_agents), state.positions.dtype)
+        features = jnp.concatenate(
+            [state.velocities, state.positions, landmarks.reshape(flat), agents.reshape(flat), silence], axis=1
+        )
+        agent_mask, landmark_mask = params.agent_mask, params.landmark_mask
+        if agent_mask is None:
+            agent_mask = jnp.ones(self.num_agents, bool)
+        else:
+            features = jnp.where(agent_mask[:, None], features, 0.0)
+        if landmark_mask is None:
+            landmark_mask = jnp.ones(self.num_landmarks, bool)
+        return Observation(
+            features=features,
+            positions=state.positions,
+            agent_mask=agent_mask,
+            landmark_mask=landmark_mask,
+            action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
+            state=pack_state(state),
+        )
+
+    def measure(self, state: SpreadState, params: SpreadParams) -> Metrics:
+        """The measurements of one step; `gacrl.evaluation.metrics` turns them into an episode's.
+
+        Distances in arena units; coverages are fractions of the landmarks that have an agent within the
+        radius in the name; `collisions` counts touching pairs, `near_agents` is the fraction of agents with
+        a neighbour within `NEAR_DISTANCE`.
+        """
+        _, to_landmarks = pairwise_offsets(state.positions, state.landmarks)
+        landmark_distance = _over_agents(to_landmarks, params)
+        hidden = None if params.landmark_mask is None else params.landmark_mask[None, :]
+        own_distance = jnp.min(_masked(to_landmarks, hidden, jnp.inf), axis=1)
+        neighbour_distance = _nearest_agent(state.positions, params.agent_mask)
+        touching = _touching(state.positions, params).sum()
+
+        agents, landmarks = params.agent_mask, params.landmark_mask
+        shared = -_masked(landmark_distance, landmarks).sum()
+        own = -touching / _count(agents, self.num_agents)
+        learner_raw = (
+            params.collision_penalty * own * params.local_ratio + shared * (1 - params.local_ratio)
+        )
+
+        coverage = {f"coverage_{r}": _mean(landmark_distance < r, landmarks) for r in COVERAGE_RADII}
+        return {
+            "reward_raw": own * REPORTED_LOCAL_RATIO + shared * (1 - REPORTED_LOCAL_RATIO),
+            "reward_shaped": paper_shaped_reward(
+                learner_raw,
+                own_distance,
+                neighbour_distance,
+                params.coverage_threshold,
+                self.collision_distance,
+                self.collision_term,
+                agents,
+            ),
+            **coverage,
+            "coverage_theta": _mean(landmark_distance < params.coverage_threshold, landmarks),
+            f"success_{CAPTURE_RADIUS}": _all(landmark_distance < CAPTURE_RADIUS, landmarks),
+            "distance_agent_landmark": _mean(own_distance, agents),
+            "distance_landmark_agent": _mean(landmark_distance, landmarks),
+            "distance_agent_agent": _mean_pair_distance(state.positions, agents),
+            "collisions": touching / 2,
+            "near_agents": _mean(neighbour_distance < NEAR_DISTANCE, agents),
+        }
+
+    def _place(self, key: PRNGKey, params: SpreadParams) -> SpreadState:
+        place_key, heading_key = jax.random.split(key)
+        places = jax.random.uniform(
+            place_key, (self.num_agents + self.num_landmarks, 2), dtype=float, minval=-1.0, maxval=1.0
+        )
+        places *= params.arena_scale
+        heading = jax.random.uniform(heading_key, (self.num_landmarks,), dtype=float, maxval=2 * jnp.pi)
+        speed = params.landmark_speed * params.physics.top_speed
+        return SpreadState(
+            positions=places[: self.num_agents],
+            velocities=jnp.zeros((self.num_agents, 2), places.dtype),
+            landmarks=places[self.num_agents :],
+            landmark_velocities=speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
+            clock=jnp.zeros((), jnp.int32),
+        )
+
+    def _move(self, state: SpreadState, action: Array, params: SpreadParams) -> SpreadState:
+        forces = action_forces(action, params.physics, self.continuous_actions)
+        forces += contact_forces(state.positions, params.agent_mask, params.physics)
+        positions, velocities = integrate(state.positions, state.velocities, forces, params.physics)
+        landmarks, landmark_velocities = reflect(
+            state.landmarks + state.landmark_velocities * params.physics.time_step,
+            state.landmark_velocities,
+            params.arena_scale,
+        )
+        return SpreadState(positions, velocities, landmarks, landmark_velocities, state.clock + 1)
+
+
+def reflect(
+    positions: Float[Array, "L 2"], velocities: Float[Array, "L 2"], limit: Float[Array, ""] | float
+) -> tuple[Float[Array, "L 2"], Float[Array, "L 2"]]:
+    """Mirror what has left [−limit, limit]² back inside, once, and turn its velocity around."""
+    bounced = jnp.where(positions > limit, 2 * limit - positions, positions)
+    bounced = jnp.where(positions < -limit, -2 * limit - positions, bounced)
+    return bounced, jnp.where(jnp.abs(positions) > limit, -velocities, velocities)
+
+
+def pack_state(state: SpreadState) -> Float[Array, " S"]:
+    """The global state as one vector: S = 4 N + 4 L."""
+    return jnp.concatenate([part.reshape(-1) for part in state[:4]])
+
+
+def unpack_state(packed: Float[Array, " S"], num_agents: int) -> SpreadState:
+    """The inverse of `pack_state`; the clock is not in it and reads 0."""
+    agents, landmarks = packed[: 4 * num_agents], packed[4 * num_agents :]
+    positions, velocities = agents.reshape(2, num_agents, 2)
+    places, headings = landmarks.reshape(2, -1, 2)
+    return SpreadState(positions, velocities, places, headings, jnp.zeros((), jnp.int32))
+
+
+def _others(num_agents: int) -> Int[Array, "N N-1"]:
+    """Row i: every index but i, ascending."""
+    column = jnp.arange(num_agents - 1)[None, :]
+    return column + (column >= jnp.arange(num_agents)[:, None])
+
+
+def _nearest(
+    offsets: Float[Array, "N M 2"],
+    distance: Float[Array, "N M"],
+    mask: Bool[Array, "#N M"] | Bool[Array, " M"] | None,
+    count: int | None,
+) -> Float[Array, "N K 2"]:
+    """The offsets of the `count` nearest, nearest first and zero-padded; of all in order where it is None."""
+    if mask is not None:
+        mask = jnp.broadcast_to(mask, distance.shape)
+        offsets = jnp.where(mask[..., None], offsets, 0.0)
+        distance = jnp.where(mask, distance, jnp.inf)
+    if count is None:
+        return offsets
+    nearest = jnp.argsort(distance, axis=1)[:, :count]
+    chosen = jnp.take_along_axis(offsets, nearest[..., None], axis=1)
+    return jnp.pad(chosen, ((0, 0), (0, count - chosen.shape[1]), (0, 0)))
+
+
+def _over_agents(to_landmarks: Float[Array, "N L"], params: SpreadParams) -> Float[Array, " L"]:
+    """Each landmark's distance to its nearest agent."""
+    mask = None if params.agent_mask is None else params.agent_mask[:, None]
+    return jnp.min(_masked(to_landmarks, mask, jnp.inf), axis=0)
+
+
+def _between_agents(
+    positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None
+) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
+    """Distances between agents, and which entries are pairs of two real ones."""
+    _, distance = pairwise_offsets(positions, positions)
+    pairs = ~jnp.eye(positions.shape[0], dtype=bool)
+    if mask is not None:
+        pairs &= mask[:, None] & mask[None, :]
+    return distance, pairs
+
+
+def _touching(positions: Float[Array, "N 2"], params: SpreadParams) -> Bool[Array, "N N"]:
+    distance, pairs = _between_agents(positions, params.agent_mask)
+    return (distance < 2 * params.physics.agent_radius) & pairs
+
+
+def _nearest_agent(positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None) -> Float[Array, " N"]:
+    """Each agent's distance to its nearest neighbour; infinity where it has none."""
+    distance, pairs = _between_agents(positions, mask)
+    return jnp.min(jnp.where(pairs, distance, jnp.inf), axis=1)
+
+
+def _mean_pair_distance(positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None) -> Float[Array, ""]:
+    """Mean distance between two agents; 0 for one agent alone."""
+    distance, pairs = _between_agents(positions, mask)
+    return jnp.where(pairs, distance, 0.0).sum() / jnp.maximum(pairs.sum(), 1)
+
+
+def _masked(values: Array, mask: Array | None, fill: float = 0.0) -> Array:
+    return values if mask is None else jnp.where(mask, values, fill)
+
+
+def _count(mask: Bool[Array, " M"] | None, size: int) -> Array | int:
+    return size if mask is None else mask.sum()
+
+
+def _mean(values: Array, mask: Bool[Array, " M"] | None) -> Float[Array, ""]:
+    """Mean over the real entries."""
+    return _masked(values * 1.0, mask).sum() / _count(mask, values.shape[0])
+
+
+def _all(values: Bool[Array, " M"], mask: Bool[Array, " M"] | None) -> Float[Array, ""]:
+    real = values if mask is None else values | ~mask
+    return real.all() * 1.0

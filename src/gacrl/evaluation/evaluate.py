@@ -1,0 +1,61 @@
+"""Playing a policy on fixed episodes and measuring them."""
+
+import zlib
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gacrl import rollout
+from gacrl.envs.environment import Environment, EnvParams
+from gacrl.evaluation.metrics import count_step, episode_metrics, no_steps
+from gacrl.types import Channel, Memory, Policy, PRNGKey
+
+Stream = Literal["training", "monitor", "gate", "report"]
+"""Random streams that never meet: training, the evaluations along the way, success gates, and the report."""
+
+_EVALUATION_SEED = 20_260_101
+"""The starts of evaluation episodes are the same for every run, seed and scripted policy."""
+
+
+def stream_key(stream: Stream, seed: int = _EVALUATION_SEED) -> PRNGKey:
+    """The root key of a stream of random numbers; the name is folded in, so streams never coincide."""
+    return jax.random.fold_in(jax.random.key(seed), zlib.crc32(stream.encode()))
+
+
+def evaluate(
+    env: Environment,
+    policy: Policy,
+    initial_memory: Memory,
+    params: EnvParams,
+    key: PRNGKey,
+    num_episodes: int,
+    channel: Channel | None = None,
+) -> dict[str, Float[Array, " K"]]:
+    """The metrics of K episodes, each up to its end or the environment's time limit.
+
+    The key fixes the starts and the policy's draws: the same key gives every policy the same starts.
+    """
+    start_key, act_key = jax.random.split(key)
+    carry = rollout.start(env, params, initial_memory, start_key, num_episodes)
+    measures = jax.eval_shape(
+        lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1].info
+    )
+    tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
+
+    def one_step(loop: tuple[rollout.Carry, Array, object], key: PRNGKey):
+        carry, going, tally = loop
+        carry, transition = rollout.step(env, policy, initial_memory, params, carry, key, channel)
+        counted = jax.vmap(count_step)(tally, transition.info)
+        tally = jax.tree.map(
+            lambda new, old: jnp.where(going, new, old), counted, tally
+        )  # an episode that has ended stays as it ended
+        return (carry, going & ~carry.first, tally), None
+
+    (_, _, tally), _ = jax.lax.scan(
+        one_step,
+        (carry, jnp.ones(num_episodes, bool), tally),
+        jax.random.split(act_key, env.max_cycles),
+    )
+    return jax.vmap(episode_metrics)(tally)

@@ -1,0 +1,41 @@
+"""The affine layer, laid out as papers write it: W x + b."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gacrl.types import PRNGKey
+
+
+class Linear(eqx.Module):
+    """x ↦ W x + b over the last axis of x, or with `axis=0` over the first.
+
+    Features first suits small networks on a CPU: softmax and concatenation over a handful of features then
+    run along the batch, which is the contiguous axis when a caller vmaps over the last one.
+    """
+
+    weight: Float[Array, "out in"]
+    bias: Float[Array, " out"]
+
+    def __init__(self, in_size: int, out_size: int, key: PRNGKey):
+        """Weights and biases uniform in ±1/√in_size (the default of torch.nn.Linear)."""
+        limit = in_size**-0.5
+        weight_key, bias_key = jax.random.split(key)
+        self.weight = jax.random.uniform(weight_key, (out_size, in_size), minval=-limit, maxval=limit)
+        self.bias = jax.random.uniform(bias_key, (out_size,), minval=-limit, maxval=limit)
+
+    def __call__(self, x: Float[Array, "..."], axis: Literal[0, -1] = -1) -> Float[Array, "..."]:
+        """[*b in] -> [*b out]; with `axis=0`, [in *b] -> [out *b]."""
+        if axis == 0:
+            y = jnp.tensordot(self.weight, x, axes=1)
+            return y + self.bias.reshape(-1, *[1] * (x.ndim - 1))
+        y = x @ self.weight.T
+        return y + jnp.broadcast_to(self.bias, y.shape)
+
+
+def num_parameters(network: eqx.Module) -> int:
+    """How many numbers a network learns."""
+    return sum(leaf.size for leaf in jax.tree.leaves(network))

@@ -1,0 +1,1 @@
+"""The loop that trains every algorithm, its curriculum, checkpoints and records."""

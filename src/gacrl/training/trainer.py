@@ -1,0 +1,201 @@
+"""The compiled part of training: one chunk of updates, and one evaluation, of one seed or several.
+
+A trainer knows no particular algorithm; what it trains is an `Algorithm` record.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from gacrl import rollout
+from gacrl.algorithms.algorithm import Algorithm, Hyper
+from gacrl.envs.environment import Environment, EnvParams
+from gacrl.evaluation.evaluate import Stream, evaluate, stream_key
+from gacrl.evaluation.metrics import (
+    EpisodeSummary,
+    Tally,
+    count_episodes,
+    count_step,
+    episode_metrics,
+    no_episodes,
+    no_steps,
+)
+from gacrl.training.curriculum import Curriculum, CurriculumState
+from gacrl.training.devices import map_seeds, stack_seeds
+from gacrl.types import Learner, Metrics, PRNGKey
+
+
+class TrainState(NamedTuple):
+    """The whole of a seed's training between two updates: what a checkpoint holds."""
+
+    learner: Learner
+    carry: rollout.Carry
+    env_params: EnvParams
+    curriculum: CurriculumState
+    tally: Tally
+    """The episodes under way, [E]."""
+    key: PRNGKey
+    updates: Int[Array, ""]
+
+
+class ChunkReport(NamedTuple):
+    """What a chunk of updates showed."""
+
+    episodes: EpisodeSummary
+    metrics: Metrics
+    """The update's own metrics (losses, exploration), their mean over the chunk."""
+    env_params: EnvParams
+    """The task's parameters in the chunk's last update."""
+
+
+class Trainer:
+    """Compiled functions over stacked seeds (the seeds' axis in front of every leaf).
+
+    `chunk` and `evaluate` compile once each; `num_updates` is data, so that a shorter last chunk does not
+    compile again.
+    """
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        env: Environment,
+        curriculum: Curriculum,
+        num_envs: int,
+        num_steps: int,
+        num_seeds: int = 1,
+        evaluation_env: Environment | None = None,
+    ):
+        self.algorithm = algorithm
+        self.env = env
+        self.curriculum = curriculum
+        self.num_envs = num_envs
+        self.num_steps = num_steps
+        self.num_seeds = num_seeds
+        self.evaluation_env = env if evaluation_env is None else evaluation_env
+        self.memory = algorithm.initial_memory(env.num_agents)
+        self.chunk = jax.jit(map_seeds(self._chunk, num_seeds), donate_argnums=0)
+
+    def init(self, seeds: tuple[int, ...]) -> TrainState:
+        """Fresh training states of these seeds, stacked."""
+        keys = [stream_key("training", seed) for seed in seeds]
+        return stack_seeds([self.init_member(key, self.algorithm.hyper) for key in keys])
+
+    def init_member(
+        self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None
+    ) -> TrainState:
+        """A fresh training state of one seed, with these hyperparameters in this task."""
+        return self._init(key, hyper, self.env.default_params() if params is None else params)
+
+    @partial(jax.jit, static_argnums=0)
+    def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
+        learner_key, start_key, key = jax.random.split(key, 3)
+        carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs)
+        tally = jax.vmap(lambda _: no_steps(self._measures(params)))(jnp.arange(self.num_envs))
+        return TrainState(
+            learner=self.algorithm.init(learner_key, hyper),
+            carry=carry,
+            env_params=params,
+            curriculum=self.curriculum.init(params),
+            tally=tally,
+            key=key,
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def _measures(self, params: EnvParams) -> list[str]:
+        """The names of what a step of this task measures."""
+
+        def info() -> Metrics:
+            state, _ = self.env.reset(jax.random.key(0), params)
+            shape = (self.env.num_agents, self.env.num_actions)
+            action = jnp.zeros(shape) if self.env.continuous_actions else jnp.zeros(shape[0], jnp.int32)
+            return self.env.step(state, action, jax.random.key(0), params)[1].info
+
+        return list(jax.eval_shape(info))
+
+    def _update(self, state: TrainState) -> tuple[TrainState, EpisodeSummary, Metrics]:
+        """Gather experience, learn from it, move the task on: one turn of the loop."""
+        rollout_key, update_key, key = jax.random.split(state.key, 3)
+        carry, experience = rollout.collect(
+            self.env,
+            self.algorithm.policy(state.learner, True),
+            self.memory,
+            state.env_params,
+            state.carry,
+            rollout_key,
+            self.num_steps,
+        )
+        learner, metrics = self.algorithm.update(state.learner, experience, update_key)
+        env_steps = (state.updates + 1) * (self.num_envs * self.num_steps)
+        curriculum, env_params = self.curriculum.advance(state.curriculum, env_steps, experience)
+        tally, episodes = self._count(state.tally, experience)
+        state = TrainState(learner, carry, env_params, curriculum, tally, key, state.updates + 1)
+        return state, episodes, metrics
+
+    def _count(self, tally: Tally, experience: rollout.Rollout) -> tuple[Tally, EpisodeSummary]:
+        """Follow the episodes of a rollout, and sum up those that ended in it."""
+        fresh = no_steps(tally.total)
+
+        def one_step(loop: tuple[Tally, EpisodeSummary], step: Any):
+            tally, summary = loop
+            info, done = step
+            tally = jax.vmap(count_step)(tally, info)
+            summary = count_episodes(summary, jax.vmap(episode_metrics)(tally), done)
+            tally = jax.tree.map(
+                lambda leaf, new: jnp.where(done, jnp.broadcast_to(new, leaf.shape), leaf), tally, fresh
+            )
+            return (tally, summary), None
+
+        steps = experience.transitions
+        inputs = (steps.info, steps.terminated | steps.truncated)
+        loop = (tally, no_episodes(tally.total))
+        if self.num_steps == 1:
+            return one_step(loop, jax.tree.map(lambda leaf: leaf[0], inputs))[0]
+        return jax.lax.scan(one_step, loop, inputs)[0]
+
+    def _chunk(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
+        """`num_updates` turns of the loop, for one seed."""
+
+        def body(_: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams]):
+            state, seen, totals, _ = loop
+            used = state.env_params
+            state, episodes, metrics = self._update(state)
+            seen = EpisodeSummary(
+                seen.count + episodes.count,
+                jax.tree.map(jnp.add, seen.total, episodes.total),
+                jax.tree.map(jnp.add, seen.squares, episodes.squares),
+                jax.tree.map(
+                    lambda new, old: jnp.where(episodes.count > 0, new, old), episodes.last, seen.last
+                ),
+            )
+            return state, seen, jax.tree.map(jnp.add, totals, metrics), used
+
+        shapes = jax.eval_shape(lambda: self._update(state)[2])
+        zeros: PyTree = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        state, seen, totals, used = jax.lax.fori_loop(
+            0, num_updates, body, (state, no_episodes(state.tally.total), zeros, state.env_params)
+        )
+        metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), totals)
+        return state, ChunkReport(seen, metrics, used)
+
+    def evaluate(
+        self, state: TrainState, explore: bool, stream: Stream, num_episodes: int
+    ) -> dict[str, Float[Array, "S K"]]:
+        """The metrics of K fixed episodes of each seed, in the task as configured."""
+        return self._evaluate(state.learner, explore, stream, num_episodes)
+
+    @partial(jax.jit, static_argnums=(0, 2, 3, 4))
+    def _evaluate(
+        self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
+    ) -> dict[str, Float[Array, "S K"]]:
+        env = self.evaluation_env
+
+        def one(learner: Learner) -> dict[str, Float[Array, " K"]]:
+            policy = self.algorithm.policy(learner, explore)
+            return evaluate(
+                env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes
+            )
+
+        return map_seeds(one, self.num_seeds)(learners)
