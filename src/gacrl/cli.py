@@ -1,0 +1,255 @@
+"""The command line: parse, then call one function each.
+
+Nothing heavy is imported before a command is known: `gacrl --help` answers at once.
+"""
+
+import contextlib
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gacrl import config as configuration
+from gacrl.config import RunConfig
+from gacrl.errors import UserError, reason
+
+if TYPE_CHECKING:
+    from gacrl.progress import TerminalWatcher
+    from gacrl.training.session import Run, Watcher
+
+OVERVIEW = """\
+gacrl: learning to coordinate by communicating over a graph
+
+usage: gacrl COMMAND [OPTIONS]
+
+  train      train a preset or your own settings into a new run folder
+  resume     go on exactly where a run stopped, or past its end
+  evaluate   measure a run, random, noop or oracle, here or in the real MPE2
+  render     watch a run, random, noop or oracle: a GIF
+  presets    what can be trained by name
+  config     print a preset's settings as a file to change and load
+  doctor     does this machine work, and do the algorithms learn what they must
+
+`gacrl COMMAND --help` explains a command, with examples. Some to begin with:
+
+  gacrl train --preset paper --env-steps 15000
+  gacrl evaluate runs/paper-1 --backend mpe2
+  gacrl render oracle --out oracle.gif
+"""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if words is None else words)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(OVERVIEW, end="")
+        return 0
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"gacrl {version('gacrl')}")
+        return 0
+    try:
+        if words[0] not in _COMMANDS:
+            raise UserError(configuration.unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
+        return _COMMANDS[words[0]](words[1:])
+    except UserError as error:
+        print(f"gacrl: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # whoever read our output has seen enough
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        name = f" {error.filename}" if error.filename else ""
+        print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("gacrl: interrupted", file=sys.stderr)
+        return 130
+
+
+def _train(words: list[str]) -> int:
+    from gacrl import arguments
+
+    words = ["--env.name" if word == "--env" else word for word in words]
+    asked = arguments.parse(arguments.Train, words, "train", default=arguments.Train(_base_settings(words)))
+    config = asked.settings
+    if asked.env_steps is not None and asked.episodes is not None:
+        raise UserError("--env-steps and --episodes say the same thing: give one of them")
+    env_steps = asked.env_steps if asked.episodes is None else asked.episodes * config.env.max_cycles
+    if env_steps is not None:
+        config = replace(config, training=replace(config.training, env_steps=env_steps))
+
+    def start(watcher: "Watcher") -> "Run":
+        from gacrl.training import session
+
+        return session.start(config, asked.out, watcher)
+
+    return _watched(start, asked.json)
+
+
+def _resume(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Resume, words, "resume")
+    if asked.extend is not None and asked.extend < 1:
+        raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
+
+    def resume(watcher: "Watcher") -> "Run":
+        from gacrl.training import session
+
+        return session.resume(asked.run, asked.extend, watcher)
+
+    return _watched(resume, asked.json)
+
+
+def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
+    """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
+    from gacrl.progress import TerminalWatcher
+
+    with TerminalWatcher() as terminal, _stopping(terminal):
+        from gacrl.training.devices import prepare_cpu
+
+        prepare_cpu()
+        run = work(terminal.watcher())
+    terminal.report(run)
+    if as_json:
+        print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
+    return 0 if run.summary is not None else terminal.exit_code
+
+
+@contextlib.contextmanager
+def _stopping(terminal: "TerminalWatcher") -> Iterator[None]:
+    """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
+
+    def handler(number: int, frame: Any) -> None:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        terminal.request_stop(128 + number)
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _base_settings(words: list[str]) -> RunConfig:
+    """The settings under the flags: the preset's, then those of --config; both change what --help shows."""
+    named: dict[str, str] = {}
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        flag, _, value = word.partition("=")
+        if flag in ("--preset", "--config"):
+            named[flag] = value or following
+    if "--config" not in named:
+        return configuration.preset(named.get("--preset", configuration.DEFAULT_PRESET))
+    base = configuration.preset(named["--preset"]) if "--preset" in named else None
+    return configuration.load(Path(named["--config"]), base)
+
+
+def _evaluate(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Evaluate, words, "evaluate")
+    if asked.episodes < 1:
+        raise UserError(f"--episodes must be at least 1, not {asked.episodes}")
+    from gacrl.training.devices import prepare_cpu
+
+    prepare_cpu()
+    from gacrl.experiments import scoring
+    from gacrl.progress import print_evaluation
+
+    scores = scoring.score_run(
+        asked.run,
+        episodes=asked.episodes,
+        changes=scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale),
+        backend=asked.backend,
+        warn=_warn,
+    )
+    print_evaluation(scores)
+    if asked.json:
+        print(json.dumps(scores))
+    return 0
+
+
+def _render(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Render, words, "render")
+    if not 1 <= asked.episodes <= 100:
+        raise UserError(f"--episodes must be between 1 and 100, not {asked.episodes}")
+    if not 64 <= asked.size <= 4096:
+        raise UserError(f"--size must be between 64 and 4096 pixels, not {asked.size}")
+    if asked.out.exists() and not asked.overwrite:
+        raise UserError(f"{asked.out} exists: choose another --out, or say --overwrite")
+    if not asked.out.parent.is_dir():
+        raise UserError(f"there is no folder {asked.out.parent} to write {asked.out.name} into")
+    from gacrl.training.devices import prepare_cpu
+
+    prepare_cpu()
+    from gacrl import render
+    from gacrl.experiments import scoring
+
+    changes = scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale)
+    shown = scoring.record_run(asked.run, asked.episodes, changes, asked.sampled, _warn)
+    render.gif(shown, asked.out, size=asked.size, title=asked.run)
+    print(f"{asked.out}: {len(shown)} episodes of {asked.run}")
+    return 0
+
+
+def _presets(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Presets, words, "presets")
+    for name, (description, _) in configuration.PRESETS.items():
+        default = "  (the default)" if name == configuration.DEFAULT_PRESET else ""
+        print(f"{name:12} {description}{default}")
+    if asked.json:
+        print(json.dumps({name: description for name, (description, _) in configuration.PRESETS.items()}))
+    return 0
+
+
+def _config(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Config, words, "config")
+    print(configuration.dumps(configuration.preset(asked.preset)), end="")
+    return 0
+
+
+def _doctor(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Doctor, words, "doctor")
+    from gacrl.training.devices import prepare_cpu
+
+    prepare_cpu()
+    from gacrl.doctor import examine
+
+    healthy = True
+    findings: dict[str, Any] = {}
+    for finding in examine():
+        print(f"{'ok ' if finding.good else 'BAD'} {finding.what}: {finding.detail}", flush=True)
+        findings[finding.what] = {"good": finding.good, "detail": finding.detail}
+        healthy &= finding.good
+    if asked.json:
+        print(json.dumps(findings))
+    return 0 if healthy else 1
+
+
+def _warn(sentence: str) -> None:
+    print(f"gacrl: {sentence}", file=sys.stderr)
+
+
+_COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": _train,
+    "resume": _resume,
+    "evaluate": _evaluate,
+    "render": _render,
+    "presets": _presets,
+    "config": _config,
+    "doctor": _doctor,
+}

@@ -13,8 +13,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
+from gacrl.errors import UserError
 
-class ConfigError(ValueError):
+
+class ConfigError(UserError, ValueError):
     """A setting that cannot be: one sentence that names the thing and the mend."""
 
 
@@ -23,7 +25,7 @@ def _require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
-def _between(section: str, settings: object, low: float, high: float, *names: str) -> None:
+def _between(section: str, settings: object, low: int | float, high: int | float, *names: str) -> None:
     for name in names:
         value = getattr(settings, name)
         if value is not None:
@@ -309,8 +311,11 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
     return _merge(base, data, "")
 
 
-def load(path: Path) -> RunConfig:
-    """Read settings from a JSON file (as `config.json` of a run folder, or a part of it)."""
+def load(path: Path, base: RunConfig | None = None) -> RunConfig:
+    """Read settings from a JSON file (as `config.json` of a run folder, or a part of it) over a base.
+
+    Without a base: over the preset that the file names. Raises ConfigError.
+    """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -320,7 +325,7 @@ def load(path: Path) -> RunConfig:
     if not isinstance(data, dict):
         raise ConfigError(f"{path} must hold a JSON object of settings")
     try:
-        return from_dict(data)  # pyright: ignore[reportUnknownArgumentType]
+        return from_dict(data, base)  # pyright: ignore[reportUnknownArgumentType]
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -363,7 +368,9 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
     """The value as the type that the setting has; JSON has no tuples, and writes 1 for 1.0."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
-        _require(value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+        _require(
+            value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}"
+        )
         return value
     if origin is tuple and isinstance(value, list | tuple):
         inner = arguments[0]
@@ -378,7 +385,9 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
         return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(
+        hint, str(hint)
+    )
     matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
     _require(matches, f"{where} must be {wanted}, not {value!r}")
     return value

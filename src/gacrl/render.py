@@ -6,58 +6,65 @@ colour-blind, and nothing is said by colour alone.
 """
 
 import functools
+import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import matplotlib
 import numpy as np
+from jaxtyping import Float
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from gacrl.evaluation.episodes import Episode, written_whole
 
 SYMBOL_COLOURS = (
-    "#0072b2",
-    "#e69f00",
-    "#a6357a",
-    "#56b4e9",
-    "#d55e00",
-    "#f0e442",
+    "#1440b8",
+    "#e89c14",
+    "#8d3b82",
+    "#5cc8f5",
+    "#be5614",
+    "#f5f527",
     "#3d3d3d",
-    "#cc99cc",
+    "#eeb7bd",
 )
-"""Of the symbols A to H, after Okabe and Ito but for the green; later symbols begin again."""
-COVERED, UNCOVERED = "#12936b", "#87909a"
+"""Of the symbols A to H, far apart for every kind of colour vision; later symbols begin again."""
+COVERED, UNCOVERED = "#12936b", "#7b8590"
 """Of a landmark's ring."""
 
 _INK, _FAINT, _PAPER, _OUTSIDE, _BORDER = "#1f2933", "#66717d", "#ffffff", "#eef0f3", "#d5dae0"
-_BODY, _RIM = "#c3d3e6", "#3f566e"
-_BODY_ALPHA, _EDGE_ALPHA = 205, 130
+_BODY, _RIM, _TRAIL = "#c3d3e6", "#3f566e", "#6f93bd"
 _SUPERSAMPLING = 3
 _MARGIN = 0.04
 """Around everything, as a share of the picture's width."""
 _TRAIL_STEPS = 8
 _JUMP = 4.0
 """A step of this many radii is a new placement: no trail follows it."""
+_COLOURS = 96
+"""Of a GIF's soft edges."""
 _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 """How long an episode's first and last frame stay."""
 
-_Point = tuple[float, float]
+_Point: TypeAlias = tuple[float, float]
 
 
-def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: float = 10, title: str = "") -> None:
+def gif(
+    episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | float = 10, title: str = ""
+) -> None:
     """Write the episodes, one after the other, as an animated GIF that is `size` pixels wide.
 
-    Raises OSError where the file cannot be written, ValueError for no episodes or an impossible size or speed.
+    Raises OSError where the file cannot be written, ValueError without episodes or for an impossible size or
+    speed.
     """
     if not episodes:
         raise ValueError("a GIF needs at least one episode")
     if not 0 < fps <= 50:
         raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
-    numbered = [f"episode {k} of {len(episodes)}" for k in range(1, len(episodes) + 1)]
+    count = len(episodes)
     pictures = [
-        _Picture(episode, size, title, note if len(episodes) > 1 else "")
-        for episode, note in zip(episodes, numbered, strict=True)
+        _Picture(episode, size, title, f"episode {k} of {count}" if count > 1 else "")
+        for k, episode in enumerate(episodes, 1)
     ]
     moments = [(picture, t) for picture in pictures for t in range(picture.episode.num_steps + 1)]
     with written_whole(path) as file:
@@ -65,9 +72,17 @@ def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: float = 1
         frames = (
             picture.draw(t).quantize(palette=palette, dither=Image.Dither.NONE) for picture, t in moments
         )
-        durations = [pause for episode in episodes for pause in _durations(episode.num_steps, fps)]
+        colours = palette.getpalette() or []
         next(frames).save(
-            file, format="GIF", save_all=True, append_images=frames, duration=durations, loop=0
+            file,
+            format="GIF",
+            save_all=True,
+            append_images=frames,
+            duration=[pause for episode in episodes for pause in _durations(episode.num_steps, fps)],
+            loop=0,
+            palette=bytes([*colours, 0, 0, 0]),
+            transparency=len(colours) // 3,  # a pixel that stays as it was
+            optimize=True,
         )
 
 
@@ -78,7 +93,7 @@ def frame(episode: Episode, t: int, size: int = 480, title: str = "") -> Image.I
     return _Picture(episode, size, title).draw(t)
 
 
-def _durations(num_steps: int, fps: float) -> list[int]:
+def _durations(num_steps: int, fps: int | float) -> list[int]:
     """Milliseconds of each frame of an episode; GIF counts in hundredths of a second."""
     usual = round(100 / fps) * 10
     first, last = (max(usual, round(seconds * 1000)) for seconds in (_FIRST_SECONDS, _LAST_SECONDS))
@@ -86,168 +101,277 @@ def _durations(num_steps: int, fps: float) -> list[int]:
 
 
 def _palette(samples: Sequence[Image.Image]) -> Image.Image:
-    """One palette for all frames: the named colours and the commonest exactly, the rest nearly.
+    """One palette for all frames: the colours of surfaces exactly, those of their soft edges nearly.
 
-    255 colours: the last entry is left for the pixels that stay as they were.
+    Few colours make a small file. Pillow looks for the nearest one on a grid of 4 levels: none may be closer
+    than that to another.
     """
-    counts: Counter[tuple[int, int, int]] = Counter()
+    counts: Counter[tuple[int, ...]] = Counter()
     for sample in samples:
         for count, colour in sample.getcolors(sample.width * sample.height) or ():
             assert isinstance(colour, tuple)
-            counts[colour[:3]] += count
-    named = [ImageColor.getrgb(colour)[:3] for colour in (*SYMBOL_COLOURS, COVERED, UNCOVERED, _BODY)]
-    exact = list(dict.fromkeys([*named, *(colour for colour, _ in counts.most_common(80))]))
-    rest = np.array([colour for colour in counts if colour not in set(exact)], np.uint8).reshape(-1, 1, 3)
-    if len(rest):
-        mixed = Image.fromarray(rest).quantize(255 - len(exact), Image.Quantize.MEDIANCUT).getpalette() or []
-    else:
-        mixed = []
+            counts[colour] += count
+    named = [ImageColor.getrgb(colour) for colour in (*SYMBOL_COLOURS, COVERED, UNCOVERED, _INK, _PAPER)]
+    common = [colour for colour, _ in counts.most_common(24)]
+    strip = Image.fromarray(np.array(list(counts), np.uint8)[None])
+    soft = strip.quantize(_COLOURS, Image.Quantize.MEDIANCUT).convert("RGB").getcolors() or []
+    chosen: list[tuple[int, ...]] = []
+    for colour in [*named, *common, *(soft_colour for _, soft_colour in soft)]:
+        assert isinstance(colour, tuple)
+        if all(math.dist(colour, other) > 12 for other in chosen):
+            chosen.append(colour)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([part for colour in exact for part in colour] + mixed)
+    palette.putpalette([part for colour in chosen[:255] for part in colour])
     return palette
 
 
+def _view(episode: Episode) -> tuple[Float[np.ndarray, "2"], float]:
+    """Centre and half the width of the square that holds all that happens, and all of the start."""
+    discs = episode.positions[:, episode.agent_mask].reshape(-1, 2)
+    rings = episode.landmarks[:, episode.landmark_mask].reshape(-1, 2)
+    start = np.full(2, episode.arena_scale)
+    low = np.min([*(discs - episode.agent_radius), *(rings - episode.capture_radius), -start], axis=0)
+    high = np.max([*(discs + episode.agent_radius), *(rings + episode.capture_radius), start], axis=0)
+    return (low + high) / 2, float((high - low).max() / 2)
+
+
 class _Picture:
-    """An episode laid out for drawing: where things are, and what no step changes."""
+    """An episode laid out for drawing. The layout is made for a width of 480 pixels and scales with it."""
 
     def __init__(self, episode: Episode, size: int, title: str = "", note: str = "") -> None:
         if not 120 <= size <= 4096:
             raise ValueError(f"the size of a picture must be between 120 and 4096 pixels, not {size}")
         self.episode = episode
-        self._size = size
-        self._unit = size / 480
-        self._header = self._px(38)
+        self._size, self._unit = size, size / 480
         self._agents: list[int] = np.flatnonzero(episode.agent_mask).tolist()
         self._landmarks: list[int] = np.flatnonzero(episode.landmark_mask).tolist()
         self._covered, self._return = episode.covered, episode.return_so_far
         self._symbols = episode.symbols
+
         centre, reach = _view(episode)
-        self._scale = size * _SUPERSAMPLING * (0.5 - _MARGIN) / reach
-        flip = np.array([1.0, -1.0])
-        middle = size * _SUPERSAMPLING / 2
-        self._positions = middle + (episode.positions - centre) * flip * self._scale
-        self._places = middle + (episode.landmarks - centre) * flip * self._scale
-        self._origin = middle - centre * flip * self._scale
-        self._radius = episode.agent_radius * self._scale
-        self._ground = self._draw_ground()
-        self._page = self._draw_page(title, note)
+        side = size * _SUPERSAMPLING
+        self._scale = side * (0.5 - _MARGIN) / reach
+        upwards = np.array([1.0, -1.0])
+        self._discs = side / 2 + (episode.positions - centre) * upwards * self._scale
+        self._rings = side / 2 + (episode.landmarks - centre) * upwards * self._scale
+
+        x, y = (side / 2 - centre * upwards * self._scale).tolist()
+        half = episode.arena_scale * self._scale
+        self._ground = Image.new("RGB", (side, side), _OUTSIDE)
+        ground = ImageDraw.Draw(self._ground)
+        ground.rectangle((x - half, y - half, x + half, y + half), _PAPER)
+        inset, small = 5 * self._unit * _SUPERSAMPLING, _font(self._px(9) * _SUPERSAMPLING)
+        if 2 * small.getlength("start area") < half:
+            ground.text((x + half - inset, y + half - inset), "start area", UNCOVERED, small, "rb")
+        self._header, self._footer = self._px(38), self._px(38) + size
+        self._page = Image.new("RGB", (size, self._footer + self._px(92)), _PAPER)
+        self._lay_out(ImageDraw.Draw(self._page), title, note)
 
     def draw(self, t: int) -> Image.Image:
         """The frame before step t."""
         page = self._page.copy()
-        page.paste(self._draw_scene(t).reduce(_SUPERSAMPLING), (0, self._header))
-        self._draw_footer(ImageDraw.Draw(page), t)
-        return page
-
-    def _px(self, length: float) -> int:
-        """A length of the layout, made for 480 pixels of width."""
-        return round(length * self._unit)
-
-    def _fine(self, length: float) -> float:
-        """The same in the supersampled scene."""
-        return length * self._unit * _SUPERSAMPLING
-
-    def _draw_ground(self) -> Image.Image:
-        side = self._size * _SUPERSAMPLING
-        ground = Image.new("RGB", (side, side), _OUTSIDE)
-        reach = self.episode.arena_scale * self._scale
-        (x, y), corner = self._origin.tolist(), self._fine(4)
-        ImageDraw.Draw(ground).rounded_rectangle(
-            (x - reach, y - reach, x + reach, y + reach), corner, _PAPER, _BORDER, round(self._fine(1))
-        )
-        return ground
-
-    def _draw_page(self, title: str, note: str) -> Image.Image:
-        """Title, footer's captions, and the legend."""
-        episode, px = self.episode, self._px
-        page = Image.new("RGB", (self._size, self._header + self._size + px(92)), _PAPER)
-        draw = ImageDraw.Draw(page)
-        heading = title or f"{len(self._agents)} agents, {len(self._landmarks)} landmarks"
-        note_width = _font(px(11)).getlength(note)
-        room = self._size - px(32) - note_width - (px(12) if note else 0)
-        draw.text((px(16), px(19)), _shorten(heading, px(14), room), _INK, _font(px(14), True), "lm")
-        draw.text((self._size - px(16), px(20)), note, _FAINT, _font(px(11)), "rm")
-        caption_y = self._header + self._size + px(16)
-        for x, anchor, caption in self._columns():
-            draw.text((x, caption_y), caption, _FAINT, _font(px(10)), anchor)
-        ruler = self._header + self._size + px(57)
-        draw.line((px(16), ruler, self._size - px(16), ruler), _BORDER, max(1, px(1)))
-
-        items = ["agent", "landmark", "covered"]
-        items += [] if episode.adjacency is None else ["can hear"]
-        items += [] if episode.messages is None else ["message"]
-        font, icon = _font(px(11)), px(20)
-        widths = [icon + px(5) + font.getlength(item) for item in items]
-        gap = min(px(30), (self._size - px(32) - sum(widths)) / max(len(items) - 1, 1))
-        x, y = (self._size - sum(widths) - gap * (len(items) - 1)) / 2, ruler + px(18)
-        for item, width in zip(items, widths, strict=True):
-            page.paste(self._icon(item, icon), (round(x), y - icon // 2))
-            draw.text((x + icon + px(5), y), item, _INK, font, "lm")
-            x += width + gap
-        return page
-
-    def _columns(self) -> tuple[tuple[int, str, str], ...]:
-        """Of the footer: x, anchor and caption."""
-        return (
-            (self._px(16), "lm", "step"),
-            (self._size // 2, "mm", "landmarks covered"),
-            (self._size - self._px(16), "rm", "return so far"),
-        )
-
-    def _draw_footer(self, draw: ImageDraw.ImageDraw, t: int) -> None:
-        px, bottom = self._px, self._header + self._size
-        steps = self.episode.num_steps
+        page.paste(self._scene(t), (0, self._header))
+        draw, px = ImageDraw.Draw(page), self._px
+        steps, y = self.episode.num_steps, self._footer
         values = (
             f"{t} / {steps}",
             f"{self._covered[t].sum()} / {len(self._landmarks)}",
             f"{self._return[t]:.1f}".replace("-", "−"),
         )
-        for (x, anchor, _), value in zip(self._columns(), values, strict=True):
-            draw.text((x, bottom + px(36)), value, _INK, _font(px(17), True), anchor)
-        draw.rectangle((0, bottom, self._size - 1, bottom + px(3) - 1), _BORDER)
-        draw.rectangle((0, bottom, round(self._size * t / steps) - 1, bottom + px(3) - 1), _RIM)
+        for (x, anchor), value in zip(self._columns(), values, strict=True):
+            draw.text((x, y + px(36)), value, _INK, _font(px(17), True), anchor)
+        draw.rectangle((0, y, self._size, y + px(3) - 1), _BORDER)
+        if t:
+            draw.rectangle((0, y, self._size * t / steps, y + px(3) - 1), _RIM)
+        return page
 
-    def _icon(self, item: str, size: int) -> Image.Image:
-        """A specimen for the legend."""
-        side = size * _SUPERSAMPLING
-        image = Image.new("RGB", (side, side), _PAPER)
-        draw, middle = ImageDraw.Draw(image, "RGBA"), (side / 2, side / 2)
-        if item == "agent":
-            self._draw_agent(draw, middle, side * 0.42, "0")
-        elif item in ("landmark", "covered"):
-            self._draw_landmark(draw, middle, side * 0.36, item == "covered")
-            self._draw_ring(draw, middle, side * 0.36, item == "covered")
-        elif item == "can hear":
-            self._draw_edge(draw, (0, side * 0.7), (side, side * 0.3))
+    def _px(self, length: int) -> int:
+        return round(length * self._unit)
+
+    def _columns(self) -> tuple[tuple[int, str], ...]:
+        """Where the footer's numbers stand, and which side of them."""
+        return (self._px(16), "lm"), (self._size // 2, "mm"), (self._size - self._px(16), "rm")
+
+    def _lay_out(self, draw: ImageDraw.ImageDraw, title: str, note: str) -> None:
+        """What no step changes: title, captions and legend."""
+        px, small = self._px, _font(self._px(11))
+        title = " ".join(title.split())
+        if not title:
+            title = f"{_count(len(self._agents), 'agent')}, {_count(len(self._landmarks), 'landmark')}"
+        bold, room = _font(px(14), True), self._size - px(44) - small.getlength(note)
+        while bold.getlength(title) > room:
+            title = title.rstrip("…")[:-1] + "…"
+        draw.text((px(16), px(19)), title, _INK, bold, "lm")
+        draw.text((self._size - px(16), px(19)), note, _FAINT, small, "rm")
+        captions = ("step", "landmarks covered", "return so far")
+        for (x, anchor), caption in zip(self._columns(), captions, strict=True):
+            draw.text((x, self._footer + px(17)), caption, _FAINT, small, anchor)
+
+        words = ["agent", "landmark", "covered"]
+        words += [] if self.episode.adjacency is None else ["can hear"]
+        words += [] if self._symbols is None else ["message"]
+        icon = px(20)
+        widths = [icon + px(5) + small.getlength(word) for word in words]
+        gap = min(px(30), (self._size - px(24) - sum(widths)) / len(words))
+        x, y = (self._size - sum(widths) - gap * (len(words) - 1)) / 2, self._footer + px(75)
+        draw.line((px(16), y - px(18), self._size - px(16), y - px(18)), _BORDER, max(1, px(1)))
+        for word, width in zip(words, widths, strict=True):
+            self._page.paste(self._specimen(word, icon), (round(x), y - icon // 2))
+            draw.text((x + icon + px(5), y), word, _INK, small, "lm")
+            x += width + gap
+
+    def _specimen(self, word: str, size: int) -> Image.Image:
+        """What the legend shows beside a word."""
+        side = float(size * _SUPERSAMPLING)
+        image = Image.new("RGB", (round(side), round(side)), _PAPER)
+        pen, middle = _Pen(image, self._unit), (side / 2, side / 2)
+        if word == "agent":
+            pen.disc(middle, side * 0.44)
+            pen.number(middle, side * 0.44, "1")
+        elif word == "can hear":
+            pen.edge((0.0, side * 0.75), (side, side * 0.25), 120)
+        elif word == "message":
+            pen.bubble((side * 0.1, side * 0.95), side * 0.36, 0, side * 0.45)
         else:
-            self._draw_bubble(draw, (side * 0.1, side * 0.9), side * 0.3, side * 0.38, 0)
+            pen.landmark(middle, side * 0.36, word == "covered")
+            pen.ring(middle, side * 0.36, word == "covered")
         return image.reduce(_SUPERSAMPLING)
 
-    def _draw_scene(self, t: int) -> Image.Image:
-        episode = self.episode
-        scene = self._ground.copy()
-        draw = ImageDraw.Draw(scene, "RGBA")
-        said = min(t, episode.num_steps - 1)  # nothing is said after the end: the last words stay
-        here = {i: self._point(self._positions[t, i]) for i in self._agents}
-        places = [(self._point(self._places[t, j]), bool(self._covered[t, j])) for j in self._landmarks]
-        capture = episode.capture_radius * self._scale
+    def _scene(self, t: int) -> Image.Image:
+        episode, image = self.episode, self._ground.copy()
+        pen = _Pen(image, self._unit)
+        now = min(t, episode.num_steps - 1)  # nothing is said after the end: the last words stay
+        discs: list[_Point] = [(x, y) for x, y in self._discs[t].tolist()]
+        rings: list[_Point] = [(x, y) for x, y in self._rings[t].tolist()]
+        radius, capture = episode.agent_radius * self._scale, episode.capture_radius * self._scale
 
-        self._draw_trails(draw, t)
+        for i in self._agents:
+            pen.trail(self._discs[max(0, t - _TRAIL_STEPS) : t + 1, i].tolist(), radius)
         if episode.adjacency is not None:
-            for i, j in np.argwhere(episode.adjacency[said]).tolist():
-                both = episode.adjacency[said, j, i]
-                if i < j or not both:
-                    self._draw_edge(draw, here[j], here[i], one_way=not both)
-        for place, covered in places:
-            self._draw_landmark(draw, place, capture, covered)
-        for i, point in here.items():
-            self._draw_agent(draw, point, self._radius, "")
-        for place, covered in places:
-            self._draw_ring(draw, place, capture, covered)
-        for i, point in here.items():
-            self._draw_number(draw, point, self._radius, str(i))
+            hears = episode.adjacency[now]
+            strength = max(50, min(120, 4000 // max(int(hears.sum()), 1)))
+            for i, j in np.argwhere(hears).tolist():
+                if i < j or not hears[j, i]:
+                    pen.edge(discs[j], discs[i], strength, None if hears[j, i] else radius)
+        for j in self._landmarks:
+            pen.landmark(rings[j], capture, bool(self._covered[t, j]))
+        for i in self._agents:
+            pen.disc(discs[i], radius)
+        for j in self._landmarks:
+            pen.ring(rings[j], capture, bool(self._covered[t, j]))
+        for i in self._agents:
+            pen.number(discs[i], radius, str(i))
         if self._symbols is not None:
-            bubble = max(self._radius * 0.42, self._fine(6))
-            for i, point in here.items():
-                self._draw_bubble(draw, point, self._radius, bubble, int(self._symbols[said, i]))
-        return scene
+            for i in self._agents:
+                symbol = int(self._symbols[now, i])
+                if symbol >= 0:
+                    pen.bubble(discs[i], radius, symbol)
+        return image.reduce(_SUPERSAMPLING)
+
+
+class _Pen:
+    """Draws the things of the world on a supersampled image. Points and radii in its pixels."""
+
+    def __init__(self, image: Image.Image, unit: float) -> None:
+        self._draw = ImageDraw.Draw(image, "RGBA")
+        self._unit = unit * _SUPERSAMPLING
+        """One pixel of the layout."""
+
+    def trail(self, points: Sequence[Sequence[float]], radius: float) -> None:
+        """Where an agent came from: the older, the fainter."""
+        for age, ((x0, y0), (x1, y1)) in enumerate(zip(points[-2::-1], points[:0:-1], strict=True)):
+            if 0 < math.hypot(x1 - x0, y1 - y0) < _JUMP * radius:
+                strength = round(220 * (1 - age / _TRAIL_STEPS))
+                self._draw.line((x0, y0, x1, y1), _see_through(_TRAIL, strength), self._width(3))
+
+    def edge(self, sender: _Point, receiver: _Point, strength: int, arrow_at: float | None = None) -> None:
+        """A line between two who hear each other; an arrow, this far from its end, where only one does."""
+        self._draw.line((*sender, *receiver), _see_through(_RIM, strength), self._width(1.5))
+        if arrow_at is not None:
+            angle = math.atan2(receiver[1] - sender[1], receiver[0] - sender[0])
+            tip = _towards(receiver, angle, -arrow_at)
+            wings = [_towards(tip, angle + turn, -7 * self._unit) for turn in (0.45, -0.45)]
+            self._draw.polygon([tip, *wings], _RIM)
+
+    def landmark(self, point: _Point, radius: float, covered: bool) -> None:
+        """A cross in a dashed ring, or a green disc."""
+        if covered:
+            self._circle(point, radius, fill=_see_through(COVERED, 90))
+            return
+        for start in range(0, 360, 30):
+            self._draw.arc(_box(point, radius), start, start + 18, UNCOVERED, self._width(1.5))
+        for angle in (0.0, math.pi / 2):
+            ends = (*_towards(point, angle, radius * 0.3), *_towards(point, angle, -radius * 0.3))
+            self._draw.line(ends, UNCOVERED, self._width(1.5))
+
+    def ring(self, point: _Point, radius: float, covered: bool) -> None:
+        """What marks a covered landmark through the agent that stands on it."""
+        if covered:
+            self._circle(point, radius, outline=COVERED, width=self._width(3))
+
+    def disc(self, point: _Point, radius: float) -> None:
+        self._circle(point, radius, _see_through(_BODY, 200), _RIM, self._width(1.5))
+
+    def number(self, point: _Point, radius: float, text: str) -> None:
+        size = max(radius * (0.85 if len(text) < 2 else 0.7), 7 * self._unit)
+        self._draw.text(point, text, _INK, _font(round(size), True), "mm")
+
+    def bubble(self, speaker: _Point, radius: float, symbol: int, size: float | None = None) -> None:
+        """A speech bubble at the upper right of a disc, with the symbol's letter and colour."""
+        size = max(radius * 0.42, 6.5 * self._unit) if size is None else size
+        colour = SYMBOL_COLOURS[symbol % len(SYMBOL_COLOURS)]
+        angle = -math.pi / 4
+        point = _towards(speaker, angle, radius + size * 0.75)
+        rim = self._width(1.2)
+        tail = [_towards(speaker, angle, radius * 0.7)]
+        tail += [_towards(point, angle + turn, size * 0.8) for turn in (2.2, -2.2)]
+        self._draw.polygon(tail, _PAPER, _PAPER, 2 * rim)
+        self._circle(point, size + rim, fill=_PAPER)
+        self._draw.polygon(tail, colour)
+        self._circle(point, size, fill=colour)
+        letter = chr(ord("A") + symbol % 26) + (str(symbol // 26) if symbol >= 26 else "")
+        font = _font(round(size * (1.35 if len(letter) < 2 else 0.95)), True)
+        self._draw.text(point, letter, _readable_on(colour), font, "mm")
+
+    def _circle(
+        self,
+        point: _Point,
+        radius: float,
+        fill: tuple[int, ...] | str | None = None,
+        outline: str | None = None,
+        width: int = 1,
+    ) -> None:
+        self._draw.ellipse(_box(point, radius), fill, outline, width)
+
+    def _width(self, width: int | float) -> int:
+        return max(1, round(width * self._unit))
+
+
+def _box(point: _Point, radius: float) -> tuple[float, float, float, float]:
+    (x, y) = point
+    return x - radius, y - radius, x + radius, y + radius
+
+
+def _towards(point: _Point, angle: float, distance: float) -> _Point:
+    return point[0] + math.cos(angle) * distance, point[1] + math.sin(angle) * distance
+
+
+def _see_through(colour: str, alpha: int) -> tuple[int, ...]:
+    return *ImageColor.getrgb(colour)[:3], alpha
+
+
+def _readable_on(colour: str) -> str:
+    """Ink or paper, whichever stands out more."""
+    red, green, blue = ImageColor.getrgb(colour)[:3]
+    return _INK if 0.299 * red + 0.587 * green + 0.114 * blue > 140 else _PAPER
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+@functools.cache
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which comes with matplotlib: the same everywhere, and it has every letter of a title."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), max(size, 1))

@@ -20,9 +20,7 @@ class Carry(NamedTuple):
     """An episode opens with the next step."""
 
 
-def start(
-    env: Environment, params: EnvParams, memory: Memory, key: PRNGKey, num_envs: int
-) -> Carry:
+def start(env: Environment, params: EnvParams, memory: Memory, key: PRNGKey, num_envs: int) -> Carry:
     """E fresh episodes. memory: the policy's initial memory for one environment."""
     env_state, observation = jax.vmap(env.reset, (0, None))(jax.random.split(key, num_envs), params)
     memories = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), memory)

@@ -56,8 +56,8 @@ def close(ours, theirs, atol: float = 1e-5) -> None:
 @pytest.mark.parametrize("max_cycles", [1, 7])
 def test_an_episode_is_exactly_max_cycles_steps(max_cycles, reset_on_collision):
     env = Spread(max_cycles=max_cycles, reset_on_collision=reset_on_collision)
-    # Wide enough that agents are put elsewhere several times.
-    params = numbers(env, reset_distance=0.5)
+    # So wide that agents and landmarks are put elsewhere after every step.
+    params = numbers(env, reset_distance=10.0)
 
     def step(state, key):
         action_key, step_key = jax.random.split(key)
@@ -156,6 +156,10 @@ def padded_and_small(seed: int, **structure):
         landmark_mask=jnp.zeros(5, bool).at[LANDMARKS].set(True),
     )
     state = crowd(seed, 3, 2, reach=0.4)
+    if seed % 2:
+        # Success, whatever padded landmarks lie uncovered.
+        state = state._replace(landmarks=state.positions[:2] + 0.1 * state.velocities[:2] + 0.02)
+        state = state._replace(landmark_velocities=jnp.zeros((2, 2)))
     surroundings = crowd(seed + 1, 5, 5, reach=0.4)
     padded = SpreadState(
         # The padding stands on agents and on landmarks, to the very point.
@@ -176,6 +180,7 @@ def padded_and_small(seed: int, **structure):
 @pytest.mark.parametrize("reward", ["mpe2", "paper"])
 @pytest.mark.parametrize("seen", [None, 2])
 def test_padding_changes_nothing_for_the_real_ones(seen, reward):
+    endings = set()
     for seed in range(10):
         large, params, padded, small, state = padded_and_small(
             seed,
@@ -196,11 +201,13 @@ def test_padding_changes_nothing_for_the_real_ones(seen, reward):
             close(crowded.reward[AGENTS], alone.reward)
             close(crowded.info, alone.info)
             assert (crowded.terminated, crowded.truncated) == (alone.terminated, alone.truncated)
+            endings.add((bool(alone.terminated), bool(alone.truncated)))
             close(real_features(crowded.observation.features, large), alone.observation.features)
             np.testing.assert_array_equal(crowded.reward[np.array([1, 4])], 0.0)
             np.testing.assert_array_equal(crowded.observation.features[np.array([1, 4])], 0.0)
             np.testing.assert_array_equal(crowded.observation.agent_mask, params.agent_mask)
             np.testing.assert_array_equal(crowded.observation.landmark_mask, params.landmark_mask)
+    assert endings >= {(False, False), (False, True), (True, False)}
 
 
 def real_features(features, env: Spread):

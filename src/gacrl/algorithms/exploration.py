@@ -58,9 +58,7 @@ def no_coverage() -> Coverage:
     return Coverage(total=zero, steps=none, last_episode=zero, episode=none)
 
 
-def follow_coverage(
-    past: Coverage, coverage: Float[Array, " E"], done: Bool[Array, " E"]
-) -> Coverage:
+def follow_coverage(past: Coverage, coverage: Float[Array, " E"], done: Bool[Array, " E"]) -> Coverage:
     """Take in one step of E environments that keep time together (the paper has one).
 
     The mean over the environments counts; an episode ends when any environment's does.

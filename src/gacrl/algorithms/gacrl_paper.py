@@ -178,8 +178,13 @@ def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*
 
 
 def behaviour_probabilities(logits: Float[Array, "*b A"], epsilon: Float[Array, ""]) -> Float[Array, "*b A"]:
-    """What the agents act by: with probability ε uniformly, else by the policy of (11)."""
-    return (1 - epsilon) * jax.nn.softmax(logits) + epsilon / logits.shape[-1]
+    """What the agents act by: with probability ε uniformly, else by the policy of (11).
+
+    Actions with a logit of −∞ are not available: neither part of the mixture takes them.
+    """
+    available = logits > -jnp.inf
+    uniform = available / available.sum(-1, keepdims=True)
+    return (1 - epsilon) * jax.nn.softmax(logits) + epsilon * uniform
 
 
 class Experience(NamedTuple):
@@ -220,7 +225,7 @@ def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) 
 
 
 def policy_loss(
-    log_probability: Float[Array, "N B+1"], reward: Float[Array, "B+1"], batch_size: int
+    log_probability: Float[Array, "N rows"], reward: Float[Array, " rows"], batch_size: int
 ) -> Float[Array, ""]:
     """Equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
 
@@ -268,9 +273,7 @@ def loss(
     )(columns, noise)
     value = jax.vmap(network.critic, in_axes=-1)(columns.features[..., :batch_size])
     parts = {
-        "loss_policy": policy_loss(
-            log_probability(output.logits, columns.action), rows.reward, batch_size
-        ),
+        "loss_policy": policy_loss(log_probability(output.logits, columns.action), rows.reward, batch_size),
         "loss_critic": critic_loss(value, rows.reward[:batch_size]),
         "loss_kl": kl_loss(
             output.mean[..., :batch_size],
@@ -279,9 +282,7 @@ def loss(
         ),
     }
     total = (
-        parts["loss_policy"]
-        + hyper.critic_weight * parts["loss_critic"]
-        + hyper.kl_weight * parts["loss_kl"]
+        parts["loss_policy"] + hyper.critic_weight * parts["loss_critic"] + hyper.kl_weight * parts["loss_kl"]
     )
     return total, parts
 

@@ -1,7 +1,8 @@
 """A ring of past experience: fixed size, any pytree, uniform sampling."""
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
@@ -11,7 +12,7 @@ from gacrl.types import PRNGKey
 Item = TypeVar("Item")
 
 
-class Replay(NamedTuple, Generic[Item]):
+class Replay(eqx.Module, Generic[Item]):
     """The newest `capacity` items; every leaf of `items` has the capacity as its first axis."""
 
     items: Item

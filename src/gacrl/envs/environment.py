@@ -1,6 +1,6 @@
 """What an environment is: pure functions over one copy, vmapped by whoever needs many."""
 
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from jaxtyping import Array, Bool, Float
 
@@ -24,6 +24,7 @@ class TimeStep(NamedTuple):
     """Measurements after the step; `reward_raw` is always among them."""
 
 
+@runtime_checkable
 class Environment(Protocol):
     """A task for N agents. Write it for one copy; resets after an episode's end are the rollout's."""
 

@@ -63,9 +63,7 @@ def action_forces(action: Array, physics: Physics, continuous: bool) -> Float[Ar
     """
     if continuous:
         pushes = jnp.clip(action, 0.0, 1.0)
-        unit = jnp.stack(
-            [pushes[:, RIGHT] - pushes[:, LEFT], pushes[:, UP] - pushes[:, DOWN]], axis=-1
-        )
+        unit = jnp.stack([pushes[:, RIGHT] - pushes[:, LEFT], pushes[:, UP] - pushes[:, DOWN]], axis=-1)
     else:
         unit = jnp.asarray(DIRECTIONS)[action]
     return physics.action_force * unit

@@ -1,9 +1,10 @@
-"""Policies that learn nothing: the floor (`random`, `noop`) and a strong heuristic, `oracle`.
+"""Policies that learn nothing: two floors, `random` and `noop`, and a ceiling, `oracle`.
 
-The oracle sees the exact state. It assigns agents to landmarks once per episode, at the least total distance,
-and then every agent takes the action after which it would come to rest nearest to its target, while it
-shuns the others. Where landmarks lie so close that two agents could not stand on both, it shifts the targets,
-or sends one agent in between. It is no optimum: a learned policy may beat it.
+The oracle reads the exact state, whatever the agents themselves observe. At an episode's start it assigns
+agents to landmarks at the least total squared distance. Then every agent takes the push after which it
+would coast nearest to its target, and counts coming too close to another agent as distance. Targets are
+adjusted so that there is room for everyone: two agents cannot stand on two landmarks closer than their discs
+are wide. The oracle is a strong heuristic and no optimum: a learned policy may beat it.
 """
 
 from typing import NamedTuple
@@ -14,162 +15,195 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.assignment import assign
-from gacrl.envs.particles import DIRECTIONS, DOWN, LEFT, RIGHT, UP, Physics, pairwise_offsets
+from gacrl.envs.particles import DIRECTIONS, Physics, pairwise_offsets
 from gacrl.envs.spread import CAPTURE_RADIUS, Spread, SpreadState, reflect, unpack_state
 from gacrl.types import Channel, Decision, Memory, Observation, Policy, PRNGKey
 
 SCRIPTED = ("random", "noop", "oracle")
 
-FREE, UNASSIGNED = -1, -2
-T = dict(shared=0.15, slack=0.005, elbow=0.03, weight=1.0, glide=1.75, metric='l2', pairlead=1,power=2,iters=2, oneslack=0.0, relax=4, mass=0.02, merge="later", lead=1.0, freegive=10.0, soft="lin", others=0.0)
+UNASSIGNED = -2
+"""The oracle's memory before an episode's first step; -1 is `assign`'s mark of an agent without landmark."""
+SHARED_DISTANCE = 0.17
+"""Landmarks this close get one agent, midway: it covers both, where two agents would push each other off."""
+SHIFT = 0.95 * CAPTURE_RADIUS
+"""How far a target may move off its landmark and still be sure to cover it."""
+ELBOW_ROOM = 0.02
+"""Agents keep this far apart, disc to disc, unless it costs them as much in distance to their targets."""
 
 
 class Scripted(NamedTuple):
-    """A policy, and its memory at the start of an episode, for one environment."""
+    """A policy, and its memory at an episode's start, both for one environment."""
 
     policy: Policy
     initial_memory: Memory
 
 
 def make(name: str, env: Spread) -> Scripted:
-    if name == "random":
-        return Scripted(_random(env), ())
-    if name == "noop":
-        return Scripted(_noop(env), ())
-    if name == "oracle":
-        return Scripted(_oracle(env), jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
-    raise ValueError(f"There is no scripted policy {name!r}; there are {', '.join(SCRIPTED)}.")
+    """The scripted policy of that name (`SCRIPTED`) for this task.
+
+    The oracle takes physics and arena scale, which no observation tells, from `env.initial_params`; masks,
+    places and velocities of agents and landmarks it reads from the observation.
+
+    Raises ValueError for an unknown name.
+    """
+    match name:
+        case "random":
+            return Scripted(_random(env), ())
+        case "noop":
+            return Scripted(_noop(env), ())
+        case "oracle":
+            return Scripted(_oracle(env), jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
+        case _:
+            raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(SCRIPTED)}.")
 
 
 def _random(env: Spread) -> Policy:
-    def policy(memory, observation, key, channel):
+    """Every action of the action space is equally likely."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         shape = (env.num_agents, env.num_actions)
         if env.continuous_actions:
             return Decision(jax.random.uniform(key, shape)), memory
-        return Decision(jax.random.randint(key, shape[:1], 0, shape[1])), memory
+        return Decision(jax.random.randint(key, shape[:1], 0, env.num_actions)), memory
 
     return policy
 
 
 def _noop(env: Spread) -> Policy:
-    def policy(memory, observation, key, channel):
-        if env.continuous_actions:
-            return Decision(jnp.zeros((env.num_agents, env.num_actions))), memory
-        return Decision(jnp.zeros(env.num_agents, jnp.int32)), memory
+    """Nobody ever pushes."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        return Decision(_as_action(jnp.zeros((env.num_agents, 2)), env.continuous_actions)), memory
 
     return policy
 
 
 def _oracle(env: Spread) -> Policy:
-    physics, limit = env.initial_params.physics, env.initial_params.arena_scale
+    """Memory: each agent's landmark [N], fixed from the episode's first step on."""
+    physics, arena_scale = env.initial_params.physics, env.initial_params.arena_scale
 
-    def policy(memory, observation, key, channel):
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if observation.state is None:
+            raise ValueError("The oracle needs an environment that puts its state into the observation.")
         state = unpack_state(observation.state, env.num_agents)
-        middle, spare = _meeting_points(state, observation.landmark_mask)
+        agents = observation.agent_mask
+        posts, wanted = _posts(state, observation.landmark_mask)
 
-        def assign_all(_):
-            distance = _pair_time(state, middle, limit, physics) ** T["power"]
-            wanted = observation.landmark_mask & ~spare
-            possible = observation.agent_mask[:, None] & wanted[None, :]
-            landmark = assign(jnp.where(possible, distance, jnp.inf))
-            return jnp.where(observation.agent_mask & wanted[landmark], landmark, FREE)
+        def assign_agents(_: Int[Array, " N"]) -> Int[Array, " N"]:
+            meeting = jax.vmap(_intercept, (0, None, None, None, None))(
+                state.positions[:, None], posts, state.landmark_velocities, arena_scale, physics
+            )
+            squares = jnp.square(meeting - state.positions[:, None]).sum(-1)
+            return assign(jnp.where(agents[:, None] & wanted[None, :], squares, jnp.inf))
 
-        landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_all, memory)
-        free = landmark == FREE
-        gliding = _glide(state.positions, state.velocities, physics)
-        ahead = _ahead(gliding, middle[landmark], state.landmark_velocities[landmark], limit, physics)
-        target = jnp.where(free[:, None], gliding, ahead)
-        target = _make_room(target, free, observation.agent_mask, physics)
-        pushes = _pushes(target, gliding, physics, env.continuous_actions)
-        outcome = gliding[:, None] + T["glide"] * physics.time_step**2 * physics.action_force * pushes
-        off = jnp.linalg.norm(outcome - target[:, None], axis=-1)
-        free_choice = jnp.take_along_axis(outcome, off.argmin(axis=1)[:, None, None], axis=1)[:, 0]
-        others = gliding + T["others"] * (free_choice - gliding)
-        cost = off + T["weight"] * _crowding(outcome, others, observation.agent_mask, physics)
-        best = jnp.argmin(cost, axis=1)
-        if not env.continuous_actions:
-            return Decision(best.astype(jnp.int32)), landmark
-        push = jnp.take_along_axis(pushes, best[:, None, None], axis=1)[:, 0]
-        action = jnp.zeros((env.num_agents, env.num_actions)).at[:, jnp.array([RIGHT, UP])].set(jnp.maximum(push, 0.0))
-        action = action.at[:, jnp.array([LEFT, DOWN])].set(jnp.maximum(-push, 0.0))
-        return Decision(action), landmark
+        # A loop that runs once at most: mapped over environments, `cond` would compute both of its branches
+        # in every step, while a loop ends at once where all environments are assigned.
+        landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
+
+        free = ~(agents & (landmark >= 0) & wanted[landmark])
+        coasting, reach = _coast(state, physics)
+        target = _intercept(
+            coasting, posts[landmark], state.landmark_velocities[landmark], arena_scale, physics
+        )
+        target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
+
+        pushes = _pushes((target - coasting) / reach, env.continuous_actions)
+        outcomes = coasting[:, None] + reach * pushes
+        distance = jnp.sqrt(jnp.square(outcomes - target[:, None]).sum(-1))
+        # The others are expected where each would go if it were alone.
+        expected = _row_choice(outcomes, distance.argmin(axis=1))
+        choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
+        return Decision(_as_action(_row_choice(pushes, choice), env.continuous_actions)), landmark
 
     return policy
 
 
-def _norm(x):
-    if T["metric"] == "l1":
-        return jnp.abs(x).sum(-1)
-    if T["metric"] == "max":
-        return jnp.abs(x).max(-1)
-    return jnp.sqrt(jnp.square(x).sum(-1))
+def _posts(
+    state: SpreadState, landmark_mask: Bool[Array, " L"]
+) -> tuple[Float[Array, "L 2"], Bool[Array, " L"]]:
+    """Where to stand to cover each landmark, and which landmarks want an agent of their own.
 
-
-def _ahead(gliding, place, velocity, limit, physics):
-    where = place
-    for _ in range(T["iters"]):
-        lead = _norm(where - gliding)[..., None] / physics.top_speed + 3 * physics.time_step
-        where, _ = reflect(place + T["lead"] * lead * velocity, jnp.broadcast_to(velocity, place.shape), limit)
-    return where
-
-
-def _pair_time(state, middle, limit, physics):
-    a, b = state.positions[:, None], jnp.broadcast_to(middle[None], (state.positions.shape[0], *middle.shape))
-    if T["pairlead"]:
-        b = _ahead(a, b, state.landmark_velocities[None], limit, physics)
-    return _norm(b - a)
-
-
-def _glide(positions, velocities, physics):
-    dt = physics.time_step
-    return positions + dt * velocities + T["glide"] * dt * (1 - physics.damping) * velocities
-
-
-def _meeting_points(state: SpreadState, mask):
-    """Middle"""
-    num = state.landmarks.shape[0]
+    Two landmarks that are each other's nearest share a post midway if they are close and stay together:
+    what they drift apart in one unit of time (ten steps) adds to their distance. One of them wants the agent.
+    """
+    index = jnp.arange(state.landmarks.shape[0])
     _, distance = pairwise_offsets(state.landmarks, state.landmarks)
-    if T["merge"] == "later":
-        later = state.landmarks + 1.0 * state.landmark_velocities
-        distance = jnp.maximum(distance, pairwise_offsets(later, later)[1])
-    pairs = mask[:, None] & mask[None, :] & ~jnp.eye(num, dtype=bool)
-    distance = jnp.where(pairs, distance, jnp.inf)
-    nearest = distance.argmin(axis=1)
-    index = jnp.arange(num)
-    merged = (nearest[nearest] == index) & (distance.min(axis=1) < T["shared"])
-    middle = jnp.where(merged[:, None], (state.landmarks + state.landmarks[nearest]) / 2, state.landmarks)
-    return middle, merged & (nearest < index)
+    _, drift = pairwise_offsets(state.landmark_velocities, state.landmark_velocities)
+    apart = jnp.where(_pairs(landmark_mask), distance + drift, jnp.inf)
+    partner = apart.argmin(axis=1)
+    shared = (partner[partner] == index) & (apart.min(axis=1) < SHARED_DISTANCE)
+    midway = (state.landmarks + state.landmarks[partner]) / 2
+    wanted = landmark_mask & ~(shared & (partner < index))
+    return jnp.where(shared[:, None], midway, state.landmarks), wanted
 
 
-def _make_room(target, free, mask, physics):
-    wish = target
-    room = 2 * physics.agent_radius + 0.002
-    give = jnp.where(free, T["freegive"], CAPTURE_RADIUS - T["slack"])[:, None]
-    pairs = mask[:, None] & mask[None, :] & ~jnp.eye(target.shape[0], dtype=bool)
-
-    def push(_, target):
-        offsets, distance = pairwise_offsets(target, target)
-        overlap = jnp.where(pairs, jnp.maximum(room - distance, 0.0), 0.0)
-        shift = -(offsets * (overlap / jnp.maximum(distance, 1e-6) / 2)[..., None]).sum(1)
-        moved = target + shift - wish
-        length = jnp.linalg.norm(moved, axis=1, keepdims=True)
-        return wish + moved * jnp.minimum(1.0, give / jnp.maximum(length, 1e-6))
-
-    return lax.fori_loop(0, T["relax"], push, target)
+def _intercept(
+    agents: Float[Array, "#M 2"],
+    posts: Float[Array, "M 2"],
+    velocities: Float[Array, "M 2"],
+    arena_scale: Float[Array, ""] | float,
+    physics: Physics,
+) -> Float[Array, "M 2"]:
+    """Where agents at top speed meet their moving posts, no sooner than `_coast` looks ahead."""
+    meeting = posts
+    for _ in range(2):  # time from place and place from time, once more
+        time = jnp.sqrt(jnp.square(meeting - agents).sum(-1)) / physics.top_speed + 3 * physics.time_step
+        meeting, _ = reflect(posts + time[:, None] * velocities, velocities, arena_scale)
+    return meeting
 
 
-def _pushes(target, gliding, physics, continuous):
-    pushes = jnp.broadcast_to(jnp.asarray(DIRECTIONS), (target.shape[0], len(DIRECTIONS), 2))
+def _make_room(
+    targets: Float[Array, "N 2"], free: Bool[Array, " N"], agent_mask: Bool[Array, " N"], physics: Physics
+) -> Float[Array, "N 2"]:
+    """Pushes targets apart that two agents could not stand on: by up to SHIFT, by any length where free."""
+    offsets, distance = pairwise_offsets(targets, targets)
+    room = 2 * (physics.agent_radius + physics.contact_margin)
+    overlap = jnp.where(_pairs(agent_mask), jnp.maximum(room - distance, 0.0), 0.0)
+    shift = -(offsets * (overlap / 2 / jnp.maximum(distance, 1e-6))[..., None]).sum(1)
+    length = jnp.maximum(jnp.sqrt(jnp.square(shift).sum(-1)), 1e-6)
+    return targets + shift * jnp.minimum(1.0, jnp.where(free, jnp.inf, SHIFT) / length)[:, None]
+
+
+def _coast(state: SpreadState, physics: Physics) -> tuple[Float[Array, "N 2"], Float[Array, ""] | float]:
+    """Positions three steps ahead without any push, and how far one of full force, now, moves them.
+
+    A push changes the velocity after the first step; in the third, damping has taken its share.
+    """
+    kept, dt = 1 - physics.damping, physics.time_step
+    effect = dt * (1 + kept)
+    return state.positions + (dt + effect * kept) * state.velocities, effect * dt * physics.action_force
+
+
+def _pushes(exact: Float[Array, "N 2"], continuous: bool) -> Float[Array, "N C 2"]:
+    """Each agent's candidates, in units of the full force: the directions, and the exact push if it may."""
+    directions = jnp.broadcast_to(jnp.asarray(DIRECTIONS), (exact.shape[0], len(DIRECTIONS), 2))
     if not continuous:
-        return pushes
-    exact = (target - gliding) / (T["glide"] * physics.time_step**2 * physics.action_force)
-    return jnp.concatenate([pushes, jnp.clip(exact, -1, 1)[:, None]], axis=1)
+        return directions
+    return jnp.concatenate([directions, jnp.clip(exact, -1.0, 1.0)[:, None]], axis=1)
 
 
-def _crowding(outcome, gliding, mask, physics):
-    comfort = 2 * physics.agent_radius + T["elbow"]
-    offsets = outcome[:, :, None] - gliding[None, None]
-    distance = jnp.sqrt(jnp.square(offsets).sum(-1))
-    between = mask[:, None] & mask[None, :] & ~jnp.eye(mask.shape[0], dtype=bool)
-    inside = jnp.where(between[:, None], jnp.maximum(comfort - distance, 0.0), 0.0)
-    return inside.sum(-1)
+def _crowding(
+    outcomes: Float[Array, "N C 2"],
+    expected: Float[Array, "N 2"],
+    agent_mask: Bool[Array, " N"],
+    physics: Physics,
+) -> Float[Array, "N C"]:
+    """How deep each outcome is inside the discs and the elbow room of the other agents, summed over them."""
+    distance = jax.vmap(lambda places: pairwise_offsets(places, expected)[1])(outcomes)
+    depth = jnp.maximum(2 * physics.agent_radius + ELBOW_ROOM - distance, 0.0)
+    return jnp.where(_pairs(agent_mask)[:, None], depth, 0.0).sum(-1)
+
+
+def _as_action(push: Float[Array, "N 2"], continuous: bool) -> Int[Array, " N"] | Float[Array, "N 5"]:
+    """The action whose force is the push, in units of the full force; the nearest one if discrete."""
+    along = push @ jnp.asarray(DIRECTIONS).T
+    return jnp.maximum(along, 0.0) if continuous else along.argmax(axis=1)
+
+
+def _pairs(mask: Bool[Array, " M"]) -> Bool[Array, "M M"]:
+    """Which entries are two different real ones."""
+    return mask[:, None] & mask[None, :] & ~jnp.eye(mask.shape[0], dtype=bool)
+
+
+def _row_choice(options: Float[Array, "N C 2"], choice: Int[Array, " N"]) -> Float[Array, "N 2"]:
+    return jnp.take_along_axis(options, choice[:, None, None], axis=1)[:, 0]

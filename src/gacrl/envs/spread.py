@@ -153,7 +153,10 @@ class Spread:
         return own * params.local_ratio + shared * (1 - params.local_ratio)
 
     def observe(self, state: SpreadState, params: SpreadParams) -> Observation:
-        """What each agent sees, in MPE2's order, and the exact state for central critics and oracles."""
+        """What each agent sees, in MPE2's order, and the exact state for central critics and oracles.
+
+        Whatever stands in the place of padding is 0.
+        """
         offsets, distance = pairwise_offsets(state.positions, state.landmarks)
         landmarks = _nearest(offsets, distance, params.landmark_mask, self.num_landmark_neighbors)
 
@@ -167,15 +170,27 @@ class Spread:
         flat = (self.num_agents, -1)
         silence = jnp.zeros((self.num_agents, 2 * self.seen_agents), state.positions.dtype)
         features = jnp.concatenate(
-            [state.velocities, state.positions, landmarks.reshape(flat), agents.reshape(flat), silence], axis=1
+            [state.velocities, state.positions, landmarks.reshape(flat), agents.reshape(flat), silence],
+            axis=1,
         )
         agent_mask, landmark_mask = params.agent_mask, params.landmark_mask
         if agent_mask is None:
             agent_mask = jnp.ones(self.num_agents, bool)
         else:
-            features = jnp.where(agent_mask[:, None], features, 0.0)
+            real = agent_mask[:, None]
+            features = jnp.where(real, features, 0.0)
+            state = state._replace(
+                positions=jnp.where(real, state.positions, 0.0),
+                velocities=jnp.where(real, state.velocities, 0.0),
+            )
         if landmark_mask is None:
             landmark_mask = jnp.ones(self.num_landmarks, bool)
+        else:
+            real = landmark_mask[:, None]
+            state = state._replace(
+                landmarks=jnp.where(real, state.landmarks, 0.0),
+                landmark_velocities=jnp.where(real, state.landmark_velocities, 0.0),
+            )
         return Observation(
             features=features,
             positions=state.positions,
@@ -183,6 +198,19 @@ class Spread:
             landmark_mask=landmark_mask,
             action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
             state=pack_state(state),
+        )
+
+    def from_features(self, features: Float[Array, "N O"]) -> Observation:
+        """The observation around bare feature vectors, as other simulators hand them out.
+
+        Positions stand in the features; the exact state is not known.
+        """
+        return Observation(
+            features=features,
+            positions=features[:, 2:4],
+            agent_mask=jnp.ones(self.num_agents, bool),
+            landmark_mask=jnp.ones(self.num_landmarks, bool),
+            action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
         )
 
     def measure(self, state: SpreadState, params: SpreadParams) -> Metrics:
@@ -202,9 +230,7 @@ class Spread:
         agents, landmarks = params.agent_mask, params.landmark_mask
         shared = -_masked(landmark_distance, landmarks).sum()
         own = -touching / _count(agents, self.num_agents)
-        learner_raw = (
-            params.collision_penalty * own * params.local_ratio + shared * (1 - params.local_ratio)
-        )
+        learner_raw = params.collision_penalty * own * params.local_ratio + shared * (1 - params.local_ratio)
 
         coverage = {f"coverage_{r}": _mean(landmark_distance < r, landmarks) for r in COVERAGE_RADII}
         return {

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import io
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -49,30 +49,7 @@ class Episode:
     """Entry [t, i, j]: j's message reaches i. None where the policy uses no graph."""
 
     def __post_init__(self) -> None:
-        steps, agents, landmarks = len(self.reward), len(self.agent_mask), len(self.landmark_mask)
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "positions": (steps + 1, agents, 2),
-            "landmarks": (steps + 1, landmarks, 2),
-            "actions": (steps, agents, None) if self.actions.ndim == 3 else (steps, agents),
-            "reward": (steps, agents),
-            "reward_raw": (steps,),
-            "agent_mask": (agents,),
-            "landmark_mask": (landmarks,),
-            "messages": (steps, agents, None),
-            "adjacency": (steps, agents, agents),
-        }
-        for name, shape in shapes.items():
-            rows = getattr(self, name)
-            if rows is None:
-                continue
-            if len(rows.shape) != len(shape) or any(
-                want not in (None, has) for want, has in zip(shape, rows.shape, strict=True)
-            ):
-                raise ValueError(f"{name} of the shape {rows.shape} does not fit the other arrays")
-            if (rows.dtype == bool) != (name in _MASKS) or rows.dtype.kind not in "biuf":
-                raise ValueError(f"{name} holds {rows.dtype}")
-            if not np.isfinite(rows).all():
-                raise ValueError(f"{name} holds numbers that are not finite")
+        _check(vars(self))
 
     @property
     def num_steps(self) -> int:
@@ -98,8 +75,10 @@ class Episode:
 
     @property
     def symbols(self) -> Int[np.ndarray, "T N"] | None:
-        """The most likely symbol of each message."""
-        return None if self.messages is None else self.messages.argmax(-1)
+        """The most likely symbol of each message; −1 for a message of zeros, which says nothing."""
+        if self.messages is None:
+            return None
+        return np.where(self.messages.any(-1), self.messages.argmax(-1), -1)
 
     def save(self, path: Path) -> None:
         """Write the episode as an .npz of plain arrays. Raises OSError where the file cannot be written."""
@@ -112,9 +91,10 @@ class Episode:
         """Read what `save` wrote. Raises ValueError for any other file, OSError for one it cannot read."""
         data = path.read_bytes()
         try:
-            return cls(**_read_arrays(data))
+            return cls(**_read(data))
         except Exception as error:  # numpy and zipfile raise a dozen kinds over a broken file
-            raise ValueError(f"{path} is not a recorded episode: {error}") from error
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(f"{path} is not a recorded episode: {reason}") from error
 
 
 _NUMBERS = ("agent_radius", "capture_radius", "arena_scale")
@@ -122,7 +102,7 @@ _MASKS = ("agent_mask", "landmark_mask", "adjacency")
 _OPTIONAL = ("messages", "adjacency")
 
 
-def _read_arrays(data: bytes) -> dict[str, Any]:
+def _read(data: bytes) -> dict[str, Any]:
     """The fields of an episode in the bytes of an .npz; arrays that it does not know are left alone."""
     if not data.startswith(b"PK"):
         raise ValueError("it is not an .npz archive")
@@ -133,7 +113,43 @@ def _read_arrays(data: bytes) -> dict[str, Any]:
                 fields[field.name] = archive[field.name]
             elif field.name not in _OPTIONAL:
                 raise ValueError(f"{field.name} is missing")
-    return {name: float(value) if name in _NUMBERS else value for name, value in fields.items()}
+    fields |= {name: float(fields[name].item()) for name in _NUMBERS}
+    _check(fields)
+    return fields
+
+
+def _check(fields: Mapping[str, Any]) -> None:
+    """Raise ValueError where the fields of an episode do not fit together."""
+    steps, agents, landmarks = (len(fields[name]) for name in ("reward", "agent_mask", "landmark_mask"))
+    if not steps:
+        raise ValueError("an episode has at least one step")
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "positions": (steps + 1, agents, 2),
+        "landmarks": (steps + 1, landmarks, 2),
+        "actions": (steps, agents, None) if fields["actions"].ndim == 3 else (steps, agents),
+        "reward": (steps, agents),
+        "reward_raw": (steps,),
+        "agent_mask": (agents,),
+        "landmark_mask": (landmarks,),
+        "messages": (steps, agents, None),
+        "adjacency": (steps, agents, agents),
+    }
+    for name, shape in shapes.items():
+        rows = fields.get(name)
+        if rows is None:
+            continue
+        fits = len(rows.shape) == len(shape) and all(
+            wanted in (None, size) for wanted, size in zip(shape, rows.shape, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{name} of the shape {rows.shape} does not fit the other arrays")
+        if (rows.dtype == bool) != (name in _MASKS) or rows.dtype.kind not in "biuf":
+            raise ValueError(f"{name} holds {rows.dtype}")
+        if not np.isfinite(rows).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    for name in _NUMBERS:
+        if not 0 < fields[name] < np.inf:
+            raise ValueError(f"{name} must be above 0, not {fields[name]}")
 
 
 @contextlib.contextmanager

@@ -100,6 +100,4 @@ def count_episodes(
     last = {
         name: jnp.where(any_done, values[newest], summary.last[name]) for name, values in episodes.items()
     }
-    return EpisodeSummary(
-        summary.count + done.sum(), add(summary.total, 1), add(summary.squares, 2), last
-    )
+    return EpisodeSummary(summary.count + done.sum(), add(summary.total, 1), add(summary.squares, 2), last)

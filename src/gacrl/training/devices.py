@@ -33,19 +33,25 @@ def devices_for(num_seeds: int) -> list[jax.Device]:
 
 
 def stack_seeds(members: list[PyTree]) -> PyTree:
-    """Pytrees of single seeds as one with the seeds in front of every axis, in the devices' shards.
-
-    Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
-    """
-    devices = devices_for(len(members))
-    padding = -len(members) % len(devices)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members, *[members[-1]] * padding)
-    return jax.device_put(stacked, _over_seeds(devices))
+    """Pytrees of single seeds as one, with the seeds in front of every axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
 
 def shard_seeds(stacked: PyTree, num_seeds: int) -> PyTree:
-    """A stacked pytree laid out on the devices for this many seeds."""
-    return jax.device_put(stacked, _over_seeds(devices_for(num_seeds)))
+    """A stacked pytree laid out on the devices.
+
+    Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
+    """
+    devices = devices_for(num_seeds)
+    members = jnp.minimum(jnp.arange(num_seeds + -num_seeds % len(devices)), num_seeds - 1)
+    mesh = Mesh(np.asarray(devices), ("seeds",))
+    padded = jax.tree.map(lambda leaf: leaf[members], stacked)
+    return jax.device_put(padded, NamedSharding(mesh, PartitionSpec("seeds")))
+
+
+def without_padding(stacked: PyTree, num_seeds: int) -> PyTree:
+    """The real seeds of a sharded pytree, on one device."""
+    return jax.device_put(jax.tree.map(lambda leaf: leaf[:num_seeds], stacked), jax.local_devices()[0])
 
 
 def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
@@ -76,7 +82,3 @@ def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any
         )(stacked, *shared)
 
     return on_all_devices
-
-
-def _over_seeds(devices: list[jax.Device]) -> NamedSharding:
-    return NamedSharding(Mesh(np.asarray(devices), ("seeds",)), PartitionSpec("seeds"))

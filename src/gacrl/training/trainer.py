@@ -24,7 +24,7 @@ from gacrl.evaluation.metrics import (
     no_steps,
 )
 from gacrl.training.curriculum import Curriculum, CurriculumState
-from gacrl.training.devices import map_seeds, stack_seeds
+from gacrl.training.devices import map_seeds, shard_seeds, stack_seeds
 from gacrl.types import Learner, Metrics, PRNGKey
 
 
@@ -37,6 +37,8 @@ class TrainState(NamedTuple):
     curriculum: CurriculumState
     tally: Tally
     """The episodes under way, [E]."""
+    episodes: Int[Array, ""]
+    """Episodes finished."""
     key: PRNGKey
     updates: Int[Array, ""]
 
@@ -76,16 +78,18 @@ class Trainer:
         self.num_seeds = num_seeds
         self.evaluation_env = env if evaluation_env is None else evaluation_env
         self.memory = algorithm.initial_memory(env.num_agents)
-        self.chunk = jax.jit(map_seeds(self._chunk, num_seeds), donate_argnums=0)
+        self.chunk = jax.jit(map_seeds(self.chunk_of_one, num_seeds), donate_argnums=0)
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
         """Fresh training states of these seeds, stacked."""
+        return shard_seeds(self.init_stacked(seeds), self.num_seeds)
+
+    def init_stacked(self, seeds: tuple[int, ...]) -> TrainState:
+        """The same, not yet laid out on the devices."""
         keys = [stream_key("training", seed) for seed in seeds]
         return stack_seeds([self.init_member(key, self.algorithm.hyper) for key in keys])
 
-    def init_member(
-        self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None
-    ) -> TrainState:
+    def init_member(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None) -> TrainState:
         """A fresh training state of one seed, with these hyperparameters in this task."""
         return self._init(key, hyper, self.env.default_params() if params is None else params)
 
@@ -100,6 +104,7 @@ class Trainer:
             env_params=params,
             curriculum=self.curriculum.init(params),
             tally=tally,
+            episodes=jnp.zeros((), jnp.int32),
             key=key,
             updates=jnp.zeros((), jnp.int32),
         )
@@ -131,7 +136,8 @@ class Trainer:
         env_steps = (state.updates + 1) * (self.num_envs * self.num_steps)
         curriculum, env_params = self.curriculum.advance(state.curriculum, env_steps, experience)
         tally, episodes = self._count(state.tally, experience)
-        state = TrainState(learner, carry, env_params, curriculum, tally, key, state.updates + 1)
+        finished = state.episodes + episodes.count
+        state = TrainState(learner, carry, env_params, curriculum, tally, finished, key, state.updates + 1)
         return state, episodes, metrics
 
     def _count(self, tally: Tally, experience: rollout.Rollout) -> tuple[Tally, EpisodeSummary]:
@@ -155,7 +161,7 @@ class Trainer:
             return one_step(loop, jax.tree.map(lambda leaf: leaf[0], inputs))[0]
         return jax.lax.scan(one_step, loop, inputs)[0]
 
-    def _chunk(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
+    def chunk_of_one(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
         """`num_updates` turns of the loop, for one seed."""
 
         def body(_: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams]):
@@ -180,22 +186,15 @@ class Trainer:
         metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), totals)
         return state, ChunkReport(seen, metrics, used)
 
-    def evaluate(
-        self, state: TrainState, explore: bool, stream: Stream, num_episodes: int
-    ) -> dict[str, Float[Array, "S K"]]:
-        """The metrics of K fixed episodes of each seed, in the task as configured."""
-        return self._evaluate(state.learner, explore, stream, num_episodes)
-
     @partial(jax.jit, static_argnums=(0, 2, 3, 4))
-    def _evaluate(
+    def evaluate(
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[Array, "S K"]]:
+        """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""
         env = self.evaluation_env
 
         def one(learner: Learner) -> dict[str, Float[Array, " K"]]:
             policy = self.algorithm.policy(learner, explore)
-            return evaluate(
-                env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes
-            )
+            return evaluate(env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes)
 
         return map_seeds(one, self.num_seeds)(learners)

@@ -1,0 +1,186 @@
+"""What each command understands, as dataclasses; their docstrings are the help."""
+
+import contextlib
+import difflib
+import io
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import tyro
+
+from gacrl import config as configuration
+from gacrl.config import RunConfig
+from gacrl.errors import UserError
+
+Arguments = TypeVar("Arguments")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train, with a live progress line, and write a run folder.
+
+    Settings come from the preset, then --config, then the flags below.
+
+    examples:
+      gacrl train                                     the default preset
+      gacrl train --preset paper --num-seeds 2        the paper's whole schedule, a seed on each core
+      gacrl train --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
+      gacrl train --config my.json --seed 7           `gacrl config` prints such a file
+    """
+
+    settings: Annotated[RunConfig, tyro.conf.arg(name="")]
+    config: Path | None = None
+    """A JSON file of settings, all or some."""
+    env_steps: int | None = None
+    """Environment steps of each seed (short for --training.env-steps)."""
+    episodes: int | None = None
+    """The same, counted in episodes."""
+    out: Path | None = None
+    """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Go on exactly where a run stopped: it ends with the same bits as one that never did.
+
+    examples:
+      gacrl resume runs/paper-1
+      gacrl resume runs/paper-1 --extend 37500        500 more episodes of 75 steps
+    """
+
+    run: tyro.conf.Positional[Path]
+    """A run folder."""
+    extend: int | None = None
+    """Environment steps to train past the planned end."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a policy on fixed episodes: greedy and sampled, beside random, noop and oracle.
+
+    RUN is a run folder, FOLDER@k for its member k, or random, noop, oracle. Every score_ is 0 for random
+    and 1 for oracle on the same starts.
+
+    examples:
+      gacrl evaluate runs/paper-1
+      gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
+      gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
+    """
+
+    run: tyro.conf.Positional[str]
+    episodes: int = 320
+    """Episodes to play."""
+    horizon: int | None = None
+    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    backend: Literal["jax", "mpe2"] = "jax"
+    """Our environment, or the real MPE2."""
+    num_agents: int | None = None
+    """Play with another number of agents and landmarks."""
+    arena_scale: float | None = None
+    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw episodes as an animated GIF: agents, landmarks, edges, message symbols, coverage.
+
+    examples:
+      gacrl render runs/paper-1 --out paper.gif
+      gacrl render oracle --out oracle.gif --episodes 2
+    """
+
+    run: tyro.conf.Positional[str]
+    out: Path = field(default=Path("episodes.gif"))
+    """The file to write; one that exists is not overwritten without --overwrite."""
+    episodes: int = 4
+    """Episodes to show."""
+    horizon: int | None = None
+    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    num_agents: int | None = None
+    """Play with another number of agents and landmarks."""
+    arena_scale: float | None = None
+    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    sampled: bool = False
+    """Explore as in training, instead of playing greedily."""
+    size: int = 480
+    """Width and height in pixels."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+
+
+@dataclass(frozen=True)
+class Presets:
+    """List what can be trained by name.
+
+    example:
+      gacrl presets
+    """
+
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Print a preset's settings, complete, as a file that `gacrl train --config FILE` loads.
+
+    example:
+      gacrl config --preset paper > my.json
+    """
+
+    preset: str = configuration.DEFAULT_PRESET
+    """Which preset."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check this machine: devices, parity with the installed MPE2, and that algorithms learn the probes.
+
+    example:
+      gacrl doctor
+    """
+
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+def parse(
+    kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None
+) -> Arguments:
+    """The arguments by their dataclass. Raises UserError with one sentence for what cannot be understood."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                kind,
+                prog=f"gacrl {command}",
+                args=words,
+                **({} if default is None else {"default": default}),
+                config=(tyro.conf.AvoidSubcommands,),
+            )
+    except SystemExit as stop:
+        if stop.code == 0:
+            raise
+        raise UserError(_sentence(said.getvalue(), command)) from None
+
+
+def _sentence(box: str, command: str) -> str:
+    """One sentence out of the parser's box: what is wrong, and the nearest option there is."""
+    lines = [line.strip("│╭╮╰╯─ ") for line in box.splitlines()]
+    lines = lines[1:] if lines else lines  # the box's title
+    problem = " ".join(lines[: lines.index("")]) if "" in lines else " ".join(lines)
+    problem = re.sub(r"^Error parsing \S+: ", "", problem).rstrip(". ")
+    problem = problem[:1].lower() + problem[1:]
+    wrong = re.findall(r"--[\w.-]+", problem)
+    options = [line.split()[0] for line in lines if line.startswith("--")]
+    near = difflib.get_close_matches(wrong[0], options, n=1, cutoff=0.3) if wrong else []
+    mend = f"did you mean {near[0]}?" if near and near[0] not in problem else f"see `gacrl {command} --help`"
+    return f"{problem}: {mend}"

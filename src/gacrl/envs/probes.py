@@ -1,0 +1,95 @@
+"""Tiny tasks with known answers: does an algorithm learn what it must be able to learn?
+
+All probes have the same shapes and are told apart by a number in their parameters, so that one compiled
+program, mapped over that number, tests them all. There are two agents; the second never sees anything. Each
+agent has two actions. The reward is the team's.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from gacrl.envs.environment import TimeStep
+from gacrl.types import Observation, PRNGKey
+
+PROBES = ("value", "observation", "discount", "action", "both", "message")
+"""In this order: a constant reward to predict; one that the observation tells; one that comes a step later;
+one that the first agent's action brings; one that it brings by matching the observation; and one that the
+second agent must match to what only the first one sees."""
+
+BEST_RETURN = {"action": 1.0, "both": 1.0, "message": 1.0}
+"""What acting well brings, in the probes in which acting matters; acting at random brings 0."""
+
+
+class ProbeParams(NamedTuple):
+    probe: Int[Array, ""] | int = 0
+    """Index into `PROBES`."""
+
+
+class ProbeState(NamedTuple):
+    sign: Float[Array, ""]
+    """−1 or 1: what the first agent may see, and what is to be matched."""
+    clock: Int[Array, ""]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """All the probes; `probe` names the one that the default parameters select."""
+
+    probe: str = "value"
+    num_agents: int = 2
+    num_landmarks: int = 1
+    num_actions: int = 2
+    observation_size: int = 2
+    max_cycles: int = 2
+    continuous_actions: bool = False
+
+    def default_params(self) -> ProbeParams:
+        return ProbeParams(jnp.asarray(PROBES.index(self.probe)))
+
+    def reset(self, key: PRNGKey, params: ProbeParams | None = None) -> tuple[ProbeState, Observation]:
+        params = self.default_params() if params is None else params
+        sign = jnp.where(jax.random.bernoulli(key), 1.0, -1.0)
+        state = ProbeState(sign, jnp.zeros((), jnp.int32))
+        return state, self.observe(state, params)
+
+    def step(
+        self, state: ProbeState, action: Int[Array, " N"], key: PRNGKey, params: ProbeParams | None = None
+    ) -> tuple[ProbeState, TimeStep]:
+        params = self.default_params() if params is None else params
+        choice = 2.0 * action - 1.0  # the two actions, as −1 and 1
+        is_discount = params.probe == PROBES.index("discount")
+        last = (state.clock == 1) | ~is_discount  # the others take a single step
+        reward = jnp.stack(
+            [
+                jnp.ones(()),
+                state.sign,
+                last.astype(float),
+                choice[0],
+                choice[0] * state.sign,
+                choice[1] * state.sign,
+            ]
+        )[params.probe]
+        state = state._replace(clock=state.clock + 1)
+        team = jnp.broadcast_to(reward, (self.num_agents,))
+        return state, TimeStep(
+            self.observe(state, params), team, last, jnp.zeros((), bool), {"reward_raw": reward}
+        )
+
+    def observe(self, state: ProbeState, params: ProbeParams) -> Observation:
+        """The first agent sees the sign, where there is something to see, and the clock; the second nothing."""
+        blind = (params.probe == PROBES.index("value")) | (params.probe == PROBES.index("discount"))
+        seen = jnp.where(blind | (params.probe == PROBES.index("action")), 0.0, state.sign)
+        features = jnp.zeros((self.num_agents, self.observation_size))
+        features = features.at[0].set(jnp.stack([seen, state.clock.astype(float)]))
+        everyone = jnp.ones(self.num_agents, bool)
+        return Observation(
+            features=features,
+            positions=None,
+            agent_mask=everyone,
+            landmark_mask=jnp.ones(self.num_landmarks, bool),
+            action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
+        )

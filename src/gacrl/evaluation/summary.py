@@ -1,0 +1,45 @@
+"""Numbers over seeds, and on the scale from random to oracle."""
+
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+def over_seeds(values: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    """Per metric: the mean over the seeds, its 95 % Student interval (null for one seed), each seed's value."""
+    return {name: _one(np.asarray(per_seed, float)) for name, per_seed in values.items()}
+
+
+def _one(values: np.ndarray) -> dict[str, Any]:
+    interval = None
+    if len(values) > 1:
+        half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * stats.sem(values)
+        interval = [float(values.mean() - half), float(values.mean() + half)]
+    return {"mean": float(values.mean()), "interval": interval, "values": [float(v) for v in values]}
+
+
+def normalised(
+    metrics: dict[str, dict[str, Any]], references: dict[str, dict[str, float]]
+) -> dict[str, dict[str, Any]]:
+    """The metrics, and for each a `score_` in which random is 0 and oracle is 1 (where the two differ)."""
+
+    def score(entry: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+        def scale(value: float) -> float:
+            return (value - low) / (high - low)
+
+        interval = entry["interval"]
+        return {
+            "mean": scale(entry["mean"]),
+            "interval": None if interval is None else sorted(scale(bound) for bound in interval),
+            "values": [scale(value) for value in entry["values"]],
+        }
+
+    scores = {
+        f"score_{name}": score(entry, references["random"][name], references["oracle"][name])
+        for name, entry in metrics.items()
+        if references["random"][name] != references["oracle"][name]
+    }
+    return {**metrics, **scores}

@@ -1,0 +1,118 @@
+"""Measuring and recording whatever `RUN` names: a run folder, one member of it, or a scripted policy."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from gacrl import envs
+from gacrl.config import EnvConfig
+from gacrl.envs import scripted
+from gacrl.envs.spread import Spread
+from gacrl.evaluation import episodes as recording
+from gacrl.evaluation import mpe2
+from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation.summary import normalised, over_seeds
+from gacrl.play import TrainedRun, open_run
+from gacrl.training.session import evaluate_scripted
+from gacrl.types import Memory, Policy
+
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What to alter about the task that a run was trained in; None leaves it."""
+
+    horizon: int | None = None
+    num_agents: int | None = None
+    arena_scale: float | None = None
+
+    def apply(self, env: EnvConfig) -> EnvConfig:
+        """The altered task. Raises ConfigError for what cannot be."""
+        changed = {"max_cycles": self.horizon, "num_agents": self.num_agents, "arena_scale": self.arena_scale}
+        return replace(env, **{name: value for name, value in changed.items() if value is not None})
+
+
+def score_run(
+    run: str,
+    episodes: int,
+    changes: Changes | None = None,
+    backend: Literal["jax", "mpe2"] = "jax",
+    warn: Warn = lambda sentence: None,
+) -> dict[str, Any]:
+    """The metrics of a policy, greedy and sampled, with those of the scripted policies on the same starts.
+
+    Returns {run, backend, episodes, horizon, num_agents, final: {greedy, sampled}, references}, as in
+    `summary.json`. MPE2 draws its own starts: there, the scripted policies play those.
+    """
+    changes = changes or Changes()
+    if run in scripted.SCRIPTED:
+        env = envs.make(changes.apply(EnvConfig()))
+        references = _references(env, episodes, backend)
+        final = {"greedy": over_seeds({name: np.array([value]) for name, value in references[run].items()})}
+    else:
+        opened = open_run(run, changes.apply, warn)
+        env = opened.trainer.env
+        references = _references(env, episodes, backend)
+        final = {
+            kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
+            for kind in ("greedy", "sampled")
+        }
+    return {
+        "run": run,
+        "backend": backend,
+        "episodes": episodes,
+        "horizon": env.max_cycles,
+        "num_agents": env.num_agents,
+        "final": {kind: normalised(metrics, references) for kind, metrics in final.items()},
+        "references": references,
+    }
+
+
+def record_run(
+    run: str,
+    episodes: int,
+    changes: Changes | None = None,
+    sampled: bool = False,
+    warn: Warn = lambda sentence: None,
+) -> list[recording.Episode]:
+    """Episodes of a policy, to look at: the first of those that `score_run` measures."""
+    changes = changes or Changes()
+    policy: Policy
+    memory: Memory
+    if run in scripted.SCRIPTED:
+        env = envs.make(changes.apply(EnvConfig()))
+        policy, memory = scripted.make(run, env)
+    else:
+        opened = open_run(run, changes.apply, warn)
+        env, policy, memory = opened.env, opened.policy(0, sampled), opened.trainer.memory
+    return recording.record_many(env, policy, memory, env.default_params(), stream_key("report"), episodes)
+
+
+def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: str) -> dict[str, np.ndarray]:
+    """Each metric's mean over the episodes, one number per member [S]."""
+    members = opened.config.num_seeds
+    if backend == "jax":
+        metrics = jax.device_get(opened.trainer.evaluate(opened.learners, explore, "report", episodes))
+        return {name: values.mean(1)[:members] for name, values in metrics.items()}
+    played = [
+        mpe2.evaluate(
+            opened.env, opened.policy(k, explore), opened.trainer.memory, stream_key("report"), episodes
+        )
+        for k in range(members)
+    ]
+    return {name: np.array([metrics[name].mean() for metrics in played]) for name in played[0]}
+
+
+def _references(env: Spread, episodes: int, backend: str) -> dict[str, dict[str, float]]:
+    if backend == "jax":
+        return evaluate_scripted(env, episodes)
+    references: dict[str, dict[str, float]] = {}
+    for name in scripted.SCRIPTED:
+        policy, memory = scripted.make(name, env)
+        metrics = mpe2.evaluate(env, policy, memory, stream_key("report"), episodes)
+        references[name] = {metric: float(values.mean()) for metric, values in metrics.items()}
+    return references

@@ -1,0 +1,136 @@
+"""Trained and scripted policies as things to hold: what `RUN` names on the command line and in Python."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gacrl import envs
+from gacrl.config import EnvConfig, GacrlPaperConfig, RunConfig
+from gacrl.envs import scripted
+from gacrl.envs.spread import Spread
+from gacrl.errors import UserError
+from gacrl.training import checkpoint, session
+from gacrl.training.recorder import RunFolder
+from gacrl.training.trainer import Trainer
+from gacrl.types import Channel, Memory, Policy
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """The newest parameters of a run, in the task that they are to be played in."""
+
+    name: str
+    config: RunConfig
+    """As trained, but for the changes of the task that were asked for."""
+    trainer: Trainer
+    learners: Any
+    """Stacked over the seeds."""
+    env_steps: int
+
+    @property
+    def env(self) -> Spread:
+        """The task to be played."""
+        return envs.make(self.config.env)
+
+    def policy(self, member: int, explore: bool) -> Policy:
+        """The policy of one seed."""
+        learner = jax.tree.map(lambda leaf: leaf[member], jax.device_get(self.learners))
+        return self.trainer.algorithm.policy(learner, explore)
+
+
+def open_run(
+    run: str | Path,
+    change: Callable[[EnvConfig], EnvConfig] = lambda env: env,
+    warn: Callable[[str], None] = lambda sentence: None,
+) -> TrainedRun:
+    """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0).
+
+    change: what to alter about the task. Raises UserError for a folder that holds no run, or parameters that
+    do not fit the task.
+    """
+    path, member = _split(str(run))
+    folder = RunFolder.open(path)
+    config = folder.config()
+    changed = replace(config, env=change(config.env), evaluation=replace(config.evaluation, horizon=None))
+    if isinstance(config.algorithm, GacrlPaperConfig) and changed.env.num_agents != config.env.num_agents:
+        raise UserError(
+            f"{path} was trained with {config.env.num_agents} agents, and the paper's GACRL is built for their "
+            "number (equation (10) puts all messages side by side): leave --num-agents out"
+        )
+    trainer = session.build(changed)
+    found, warnings = checkpoint.newest(folder.checkpoints)
+    for warning in warnings:
+        warn(warning)
+    learners = session.load_learners(found, trainer)
+    if member is not None:
+        if member >= config.num_seeds:
+            raise UserError(f"{path} has the members 0 to {config.num_seeds - 1}: there is no @{member}")
+        changed = replace(changed, seed=config.seed + member, num_seeds=1)
+        trainer = session.build(changed)
+        learners = jax.tree.map(lambda leaf: leaf[member : member + 1], jax.device_get(learners))
+    return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
+
+
+def _split(run: str) -> tuple[Path, int | None]:
+    folder, at, member = run.rpartition("@")
+    if at and member.isdigit() and not Path(run).exists():
+        return Path(folder), int(member)
+    return Path(run), None
+
+
+class LoadedPolicy:
+    """A policy for one environment at a time: observations in, actions out.
+
+    >>> policy = gacrl.load_policy("runs/paper-1")
+    >>> policy.reset(seed=0)
+    >>> actions = policy(observations)  # [N, O] -> [N]
+    """
+
+    def __init__(self, env: Spread, policies: dict[bool, Policy], initial_memory: Memory):
+        """policies: the greedy one under True, the sampling one under False."""
+        self.env = env
+        self._initial_memory = initial_memory
+        self._act = {greedy: jax.jit(policy) for greedy, policy in policies.items()}
+        self.message: np.ndarray | None = None
+        """What each agent sent at the last step, [N, V]; None where the policy sends nothing."""
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        """Start an episode: fresh memory, and random draws that follow from the seed."""
+        self._memory = self._initial_memory
+        self._key = jax.random.key(seed)
+
+    def __call__(self, observations: Float[Array | np.ndarray, "N O"], greedy: bool = True) -> np.ndarray:
+        """The actions of the N agents. Raises ValueError for observations of another shape."""
+        expected = (self.env.num_agents, self.env.observation_size)
+        observations = jnp.asarray(observations, jnp.float32)
+        if observations.shape != expected:
+            raise ValueError(f"observations must be [agents, numbers] = {expected}, not {observations.shape}")
+        self._key, key = jax.random.split(self._key)
+        seen = self.env.from_features(observations)
+        decision, self._memory = self._act[greedy](self._memory, seen, key, Channel())
+        self.message = None if decision.message is None else np.asarray(decision.message)
+        return np.asarray(decision.action)
+
+
+def load_policy(run: str | Path) -> LoadedPolicy:
+    """The policy of a run: its folder, `FOLDER@k`, or `random` and `noop`.
+
+    Raises UserError where there is no such run. The oracle needs the exact state, which observations alone
+    do not give: play it with `gacrl.envs.scripted`.
+    """
+    if str(run) in scripted.SCRIPTED:
+        if str(run) == "oracle":
+            raise UserError("the oracle needs the exact state, not observations: use gacrl.envs.scripted")
+        env = envs.make(EnvConfig())
+        actor = scripted.make(str(run), env)
+        return LoadedPolicy(env, dict.fromkeys((True, False), actor.policy), actor.initial_memory)
+    opened = open_run(run)
+    policies = {greedy: opened.policy(0, not greedy) for greedy in (True, False)}
+    return LoadedPolicy(opened.env, policies, opened.trainer.memory)

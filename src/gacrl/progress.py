@@ -1,0 +1,212 @@
+"""What the terminal shows: a header, a live line (or a line per evaluation), and tables at the end."""
+
+import time
+from types import TracebackType
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.live import Live
+from rich.spinner import Spinner
+from rich.table import Table
+from rich.text import Text
+
+from gacrl.config import RunConfig
+from gacrl.training.loop import Progress
+from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Plan, Run, Watcher
+
+_SHOWN = {
+    "return_agent_mean": "return",
+    "coverage_final_0.1": "coverage 0.1",
+    "coverage_final_0.2": "coverage 0.2",
+    "success_final_0.1": "all covered",
+    "distance_landmark_agent": "distance",
+    "collisions": "collisions",
+}
+
+
+class TerminalWatcher:
+    """Follows a run. On a terminal the line lives, also while things compile; elsewhere it is a line each."""
+
+    def __init__(self) -> None:
+        self._console = _console()
+        self._alive = self._console.is_terminal
+        self._line = _Line()
+        self._live = Live(self._line, console=self._console, refresh_per_second=8, transient=True)
+        self._stop = False
+        self.exit_code = 130
+        """What an early stop returns to the shell."""
+
+    def __enter__(self) -> "TerminalWatcher":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def request_stop(self, exit_code: int) -> None:
+        """End the run at the next checkpoint."""
+        self._stop, self.exit_code = True, exit_code
+        self._say("stopping after the evaluation under way; once more to stop at once")
+
+    def watcher(self) -> Watcher:
+        """The functions that a session calls."""
+        return Watcher(
+            planned=self._planned,
+            compiling=lambda: self._say("compiling the training program"),
+            progress=self._progress,
+            finishing=lambda: self._say("closing evaluation, episodes and GIF"),
+            warn=lambda sentence: self._console.print(f"gacrl: {sentence}"),
+            stop=lambda: self._stop,
+        )
+
+    def _planned(self, folder: RunFolder, config: RunConfig, plan: Plan) -> None:
+        env, say = config.env, self._console.print
+        seeds = ", ".join(str(seed) for seed in config.seeds)
+        say(f"run        {folder.path}")
+        say(
+            f"task       {env.name}: {env.num_agents} agents, {env.landmarks} landmarks, {env.max_cycles} steps"
+        )
+        say(f"preset     {config.preset} ({config.algorithm.name}), {plan.parameters:,} parameters")
+        say(f"seeds      {seeds} on {', '.join(plan.devices)}")
+        say(
+            f"steps      {config.num_updates * config.steps_per_update:,} per seed, "
+            f"{config.num_updates:,} updates, an evaluation every "
+            f"{config.updates_per_chunk * config.steps_per_update:,} steps"
+        )
+        memory = plan.bytes_per_seed * config.num_seeds / 2**20
+        say(f"memory     {memory:.1f} MiB for the training state, twice that while a chunk runs")
+        if self._alive:
+            self._live.start()
+
+    def _say(self, what: str) -> None:
+        if self._alive:
+            self._line.text = what
+        else:
+            self._console.print(what)
+
+    def _progress(self, progress: Progress) -> None:
+        line = describe(progress, progress.rows[0]["episodes_done"])
+        if self._alive:
+            self._line.text = line
+            self._line.fraction = progress.env_steps / progress.total_env_steps
+        else:
+            self._console.print(line)
+
+    def report(self, run: Run) -> None:
+        """The end: what was reached, the paper's tables where they apply, and where everything lies."""
+        self._live.stop()
+        say = self._console.print
+        if run.summary is None:
+            say(f"stopped at environment step {run.env_steps:,}; go on with: gacrl resume {run.folder}")
+            return
+        print_evaluation({"run": str(run.folder), **run.summary}, self._console)
+        if run.config.algorithm.name == "gacrl_paper" and run.config.env.reward == "paper":
+            self._paper_tables(run)
+        summary = run.summary
+        say(
+            f"{summary['steps_per_second']:,.0f} training steps/s, {summary['compile_seconds']:.1f} s compiling, "
+            f"{summary['wall_seconds']:.1f} s in all"
+        )
+        say(f"summary    {run.folder / 'summary.json'}")
+        say(f"episodes   {run.folder / 'episodes.gif'}")
+
+    def _paper_tables(self, run: Run) -> None:
+        from gacrl.experiments import paper_tables
+
+        with self._console.status("playing random, noop and oracle at the difficulty of each row"):
+            metrics = RunFolder(run.folder).metrics()
+            tables = {
+                paper_tables.printed()[name]["caption"]: rows(run.config, metrics)
+                for name, rows in (("table_2", paper_tables.table_2), ("table_3", paper_tables.table_3))
+            }
+        for caption, rows in tables.items():
+            if not rows:
+                continue
+            table = Table(
+                "episode",
+                "who",
+                *paper_tables.COLUMNS.values(),
+                title=caption,
+                title_justify="left",
+                box=box.SIMPLE_HEAD,
+            )
+            for row in rows:
+                cells = [
+                    _cell(row.mean.get(name), row.sd and row.sd.get(name)) for name in paper_tables.COLUMNS
+                ]
+                end = row.who == "oracle"
+                table.add_row(str(row.episode), row.who, *cells, end_section=end)
+            self._console.print(table)
+
+
+def _console() -> Console:
+    """Colours and the terminal's width on a terminal; elsewhere lines that a log can hold."""
+    console = Console(highlight=False, soft_wrap=False)
+    if not console.is_terminal:
+        console.width = 130
+    return console
+
+
+class _Line:
+    """The live line: a spinner, how far, what is going on, and for how long already."""
+
+    def __init__(self) -> None:
+        self.text = "starting"
+        self.fraction = 0.0
+        self._spinner = Spinner("dots")
+        self._begun = time.monotonic()
+
+    def __rich__(self) -> Text:
+        full = round(20 * self.fraction)
+        bar = "━" * full + "╌" * (20 - full)
+        seconds = time.monotonic() - self._begun
+        return Text.assemble(self._spinner.render(time.monotonic()), f" {bar} {self.text}  [{seconds:.0f} s]")
+
+
+def describe(progress: Progress, episode: int) -> str:
+    """One line on where a run stands; the paper's columns, the mean over this stretch's episodes and seeds."""
+
+    def mean(name: str) -> str:
+        values = [row["train"]["mean"][name] for row in progress.rows if name in row["train"]["mean"]]
+        return f"{sum(values) / len(values):.2f}" if values else "-"
+
+    return (
+        f"episode {episode:,}  {progress.clock.steps_per_second:,.0f} steps/s  "
+        f"shaped {mean('reward_shaped')}  raw {mean('reward_raw')}  "
+        f"coverage {mean('coverage_mean_theta')} (0.1: {mean('coverage_mean_0.1')})  "
+        f"distance {mean('distance_agent_landmark')}  left {_duration(progress.seconds_left)}"
+    )
+
+
+def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> None:
+    """A table of the main metrics: the policy, and random, noop and oracle on the same starts."""
+    console = _console() if console is None else console
+    title = f"{scores['run']}: {scores['episodes']} episodes of {scores['horizon']} steps"
+    table = Table("", *_SHOWN.values(), title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for kind, metrics in scores["final"].items():
+        cells: list[str] = []
+        for name in _SHOWN:
+            entry = metrics.get(name)
+            interval = entry and entry["interval"]
+            bounds = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
+            cells.append(_cell(entry and entry["mean"], None, 3) + bounds)
+        table.add_row(kind, *cells)
+    table.add_section()
+    for who, metrics in scores["references"].items():
+        table.add_row(who, *[_cell(metrics.get(name), None, 3) for name in _SHOWN])
+    console.print(table)
+
+
+def _cell(mean: float | None, sd: float | None = None, digits: int = 2) -> str:
+    if mean is None:
+        return ""
+    return f"{mean:.{digits}f}" + (f" ± {sd:.{digits}f}" if sd is not None else "")
+
+
+def _duration(seconds: float) -> str:
+    if seconds != seconds:  # not known yet
+        return "?"
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,162 @@
+"""The host's side of training: run a chunk, evaluate, tell; again until the steps are done.
+
+Whoever watches (command line, recorder, trackers, viewer, sweep) reads the one stream of `Progress`.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from gacrl.config import RunConfig
+from gacrl.errors import UserError
+from gacrl.training.trainer import ChunkReport, Trainer, TrainState
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Seconds spent so far, over all the processes that worked on a run."""
+
+    wall: float = 0.0
+    training: float = 0.0
+    """In chunks, without compilation and evaluation."""
+    compiling: float = 0.0
+    timed_env_steps: int = 0
+    """Environment steps of all seeds that `training` covers."""
+
+    @property
+    def steps_per_second(self) -> float:
+        return self.timed_env_steps / self.training if self.training > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands after a chunk and its evaluation."""
+
+    env_steps: int
+    """Of each seed."""
+    total_env_steps: int
+    clock: Clock
+    rows: tuple[dict[str, Any], ...]
+    """What `metrics.jsonl` gets: one object per seed."""
+    state: TrainState
+    """The training state, valid until the next chunk starts."""
+
+    @property
+    def done(self) -> bool:
+        return self.env_steps >= self.total_env_steps
+
+    @property
+    def seconds_left(self) -> float:
+        """By the pace of the chunks so far."""
+        seeds = len(self.rows)
+        pace = self.clock.steps_per_second
+        return (self.total_env_steps - self.env_steps) * seeds / pace if pace else float("nan")
+
+
+def train(
+    trainer: Trainer,
+    config: RunConfig,
+    state: TrainState,
+    env_steps: int = 0,
+    clock: Clock | None = None,
+    on_compile: Callable[[], None] = lambda: None,
+) -> Iterator[Progress]:
+    """Train from a state (fresh, or of a checkpoint at `env_steps`) to the configured end.
+
+    Yields after every chunk. Raises UserError as soon as a loss is not finite.
+    """
+    clock = Clock() if clock is None else clock
+    per_update = config.steps_per_update
+    done, total = env_steps // per_update, config.num_updates
+    started, before = time.perf_counter(), clock
+    compiling, training, timed = clock.compiling, clock.training, clock.timed_env_steps
+    chunk = None
+    while done < total:
+        updates = min(config.updates_per_chunk, total - done)
+        if chunk is None:
+            on_compile()
+            begun = time.perf_counter()
+            chunk = trainer.chunk.lower(state, updates).compile()
+            compiling += time.perf_counter() - begun
+        begun = time.perf_counter()
+        state, report = jax.block_until_ready(chunk(state, updates))
+        training += time.perf_counter() - begun
+        timed += updates * per_update * len(config.seeds)
+        done += updates
+        begun = time.perf_counter()
+        first = done == updates + env_steps // per_update
+        evaluations = {
+            "greedy": trainer.evaluate(state.learner, False, "monitor", config.evaluation.num_episodes),
+            "sampled": trainer.evaluate(state.learner, True, "monitor", config.evaluation.num_episodes),
+        }
+        evaluations = jax.device_get(evaluations)
+        if first:  # compiling is nearly all of the first evaluation
+            compiling += time.perf_counter() - begun
+        wall = before.wall + time.perf_counter() - started
+        clock = Clock(wall, training, compiling, timed)
+        finished = jax.device_get(state.episodes)
+        rows = _rows(config, jax.device_get(report), evaluations, done * per_update, finished, clock)
+        _require_finite(rows)
+        yield Progress(done * per_update, total * per_update, clock, rows, state)
+
+
+def _rows(
+    config: RunConfig,
+    report: ChunkReport,
+    evaluations: dict[str, Any],
+    env_steps: int,
+    finished: np.ndarray,
+    clock: Clock,
+) -> tuple[dict[str, Any], ...]:
+    """One object per seed: the chunk's training episodes, its losses, and the evaluation after it."""
+
+    def row(member: int, seed: int) -> dict[str, Any]:
+        seen = jax.tree.map(lambda leaf: leaf[member], report.episodes)
+        count = max(int(seen.count), 1)
+        mean = {name: float(total) / count for name, total in seen.total.items()}
+        spread = {
+            name: float(np.sqrt(max(float(squares) / count - mean[name] ** 2, 0.0)))
+            for name, squares in seen.squares.items()
+        }
+        return {
+            "seed": seed,
+            "env_steps": env_steps,
+            "episodes_done": int(finished[member]),
+            "train": {
+                "episodes": int(seen.count),
+                "mean": mean,
+                "sd": spread,
+                "last_episode": {name: float(value) for name, value in seen.last.items()},
+            },
+            "update": {name: float(values[member]) for name, values in report.metrics.items()},
+            "task": _difficulty(report.env_params, member),
+            **{
+                kind: {name: float(values[member].mean()) for name, values in metrics.items()}
+                for kind, metrics in evaluations.items()
+            },
+            "steps_per_second": clock.steps_per_second,
+            "compile_seconds": clock.compiling,
+            "wall_seconds": clock.wall,
+        }
+
+    return tuple(row(member, seed) for member, seed in enumerate(config.seeds))
+
+
+def _difficulty(env_params: Any, member: int) -> dict[str, float]:
+    """Those parameters of the task that a curriculum moves, where the task has them."""
+    names = ("local_ratio", "coverage_threshold", "arena_scale", "landmark_speed")
+    return {name: float(getattr(env_params, name)[member]) for name in names if hasattr(env_params, name)}
+
+
+def _require_finite(rows: tuple[dict[str, Any], ...]) -> None:
+    for row in rows:
+        for name, value in row["update"].items():
+            if not np.isfinite(value):
+                raise UserError(
+                    f"seed {row['seed']} diverged: {name} is {value} by environment step {row['env_steps']}; "
+                    "the checkpoint before it is good, try a smaller learning rate"
+                )

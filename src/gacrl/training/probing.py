@@ -1,0 +1,67 @@
+"""Training an algorithm on every probe at once, in one compiled program."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gacrl.algorithms import algorithm as algorithms
+from gacrl.config import AlgorithmConfig
+from gacrl.envs.probes import PROBES, Probe, ProbeParams
+from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.training.curriculum import constant
+from gacrl.training.trainer import Trainer
+from gacrl.types import Channel, Learner
+
+
+class ProbeResult(NamedTuple):
+    returns: dict[str, float]
+    """Greedy return of each probe."""
+    values: dict[str, tuple[float, float]]
+    """The critic's value of an episode's first observation, where the sign is −1 and where it is 1; NaN for
+    algorithms whose decisions hold no value."""
+
+
+def probe_algorithm(
+    config: AlgorithmConfig, num_updates: int, num_envs: int = 1, num_steps: int = 1, seed: int = 0
+) -> ProbeResult:
+    """Train on all probes, mapped over them, and say what was learned."""
+    env = Probe()
+    algorithm = algorithms.make(config, env)
+    trainer = Trainer(algorithm, env, constant(), num_envs, num_steps)
+
+    @jax.jit
+    def learn(probe: jax.Array) -> dict[str, jax.Array]:
+        params = ProbeParams(probe)
+        state = trainer.init_member(stream_key("training", seed), algorithm.hyper, params)
+        state, _ = trainer.chunk_of_one(state, jnp.asarray(num_updates))
+        policy = algorithm.policy(state.learner, False)
+        metrics = evaluate(env, policy, trainer.memory, params, stream_key("monitor"), 32)
+        return {
+            "return": metrics["return_agent_mean"].mean(),
+            "value": _values(trainer, env, state.learner, params),
+        }
+
+    learned = jax.device_get(jax.jit(jax.vmap(learn))(jnp.arange(len(PROBES))))
+    return ProbeResult(
+        {name: float(learned["return"][k]) for k, name in enumerate(PROBES)},
+        {
+            name: (float(learned["value"][k][0]), float(learned["value"][k][1]))
+            for k, name in enumerate(PROBES)
+        },
+    )
+
+
+def _values(trainer: Trainer, env: Probe, learner: Learner, params: ProbeParams) -> jax.Array:
+    """The value of the first observation at each sign."""
+    policy = trainer.algorithm.policy(learner, False)
+
+    def value(sign: float) -> jax.Array:
+        state, _ = env.reset(jax.random.key(0), params)
+        seen = env.observe(state._replace(sign=jnp.asarray(sign)), params)
+        decision, _ = policy(trainer.memory, seen, jax.random.key(0), Channel())
+        extras = decision.extras
+        return extras["value"] if isinstance(extras, dict) and "value" in extras else jnp.asarray(np.nan)
+
+    return jnp.stack([value(-1.0), value(1.0)])

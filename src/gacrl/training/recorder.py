@@ -1,0 +1,145 @@
+"""The run folder: what is where, written so that nothing that was there before is lost."""
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from gacrl import config as configuration
+from gacrl.config import ConfigError, RunConfig
+from gacrl.errors import UserError, reason
+
+
+class RunFolder:
+    """`config.json`, `metrics.jsonl`, `summary.json`, `checkpoints/` and `episodes/` of one run."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.config_file = path / "config.json"
+        self.metrics_file = path / "metrics.jsonl"
+        self.summary_file = path / "summary.json"
+        self.checkpoints = path / "checkpoints"
+        self.episodes = path / "episodes"
+        self.gif = path / "episodes.gif"
+
+    @classmethod
+    def create(cls, path: Path | None, config: RunConfig) -> "RunFolder":
+        """A new run folder. Without a path: the next free number under `runs/`.
+
+        Raises UserError where the path exists already, or cannot be written.
+        """
+        try:
+            if path is None:
+                path = _next_free(Path("runs"), config.preset)
+            elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+                mend = f"continue it with `gacrl resume {path}`" if _is_run(path) else "it holds other things"
+                raise UserError(f"{path} exists and is not overwritten: choose another --out, or {mend}")
+            else:
+                path.mkdir(parents=True, exist_ok=True)
+            folder = cls(path)
+            folder.checkpoints.mkdir()
+            folder.episodes.mkdir()
+            folder._replace(folder.config_file, configuration.dumps(config))
+            folder.metrics_file.touch()
+        except OSError as error:
+            raise UserError(
+                f"cannot write the run folder {path}: {reason(error)}; choose another with --out"
+            ) from error
+        return folder
+
+    @classmethod
+    def open(cls, path: Path) -> "RunFolder":
+        """An existing run folder. Raises UserError where there is none."""
+        if not path.exists():
+            raise UserError(f"there is no run {path}: `gacrl train` makes one and prints where it is")
+        if not _is_run(path):
+            raise UserError(f"{path} is not a run folder: it has no config.json")
+        return cls(path)
+
+    def config(self) -> RunConfig:
+        """The settings that the run was started with."""
+        try:
+            return configuration.load(self.config_file)
+        except ConfigError as error:
+            raise UserError(str(error)) from error
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for one writing process; the system frees the lock of one that died."""
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise UserError(
+                f"{self.path} is in use by another gacrl process: wait for it, or stop it"
+            ) from error
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def append_metrics(self, rows: list[dict[str, Any]]) -> None:
+        """Add one line per row to `metrics.jsonl` and see it to the disk."""
+        with self.metrics_file.open("a", encoding="utf-8") as file:
+            file.writelines(json.dumps(row) + "\n" for row in rows)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Every row that was written; a last line that a crash cut off is left out.
+
+        Raises UserError for a damaged line before the last, by its number.
+        """
+        lines = self.metrics_file.read_text(encoding="utf-8").splitlines()
+        rows: list[dict[str, Any]] = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                rows.append(json.loads(line))
+            except ValueError as error:
+                if number < len(lines):
+                    raise UserError(f"line {number} of {self.metrics_file} is damaged: {error}") from error
+        return rows
+
+    def forget_metrics_after(self, env_steps: int) -> None:
+        """Drop the rows past a checkpoint: the resumed run writes them again."""
+        rows = [row for row in self.metrics() if row["env_steps"] <= env_steps]
+        self._replace(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+
+    def write_config(self, config: RunConfig) -> None:
+        """Replace the settings (an extended run has more steps)."""
+        self._replace(self.config_file, configuration.dumps(config))
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Replace `summary.json`."""
+        self._replace(self.summary_file, json.dumps(summary, indent=2) + "\n")
+
+    def _replace(self, path: Path, text: str) -> None:
+        """Write a whole file so that a reader sees the old one or the new one, never half of it."""
+        unfinished = path.with_name(f".{path.name}.unfinished")
+        with unfinished.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+
+
+def _is_run(path: Path) -> bool:
+    return (path / "config.json").is_file()
+
+
+def _next_free(parent: Path, name: str) -> Path:
+    """Make and return `parent/name-K`, K one more than any there is."""
+    parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        taken = [re.fullmatch(rf"{re.escape(name)}-(\d+)", entry.name) for entry in parent.iterdir()]
+        number = max((int(match[1]) for match in taken if match), default=0) + 1
+        try:
+            (parent / f"{name}-{number}").mkdir()
+        except FileExistsError:
+            continue  # another process was quicker
+        return parent / f"{name}-{number}"

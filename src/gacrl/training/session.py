@@ -1,0 +1,241 @@
+"""A run from its settings to its summary: what the command line and `gacrl.train` both call."""
+
+import platform
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gacrl import config as configuration
+from gacrl import envs, render
+from gacrl.algorithms import algorithm as algorithms
+from gacrl.config import RunConfig
+from gacrl.envs import scripted
+from gacrl.errors import UserError, reason
+from gacrl.evaluation import episodes
+from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.evaluation.summary import normalised, over_seeds
+from gacrl.training import checkpoint, curriculum
+from gacrl.training.devices import devices_for, shard_seeds, without_padding
+from gacrl.training.loop import Clock, Progress, train
+from gacrl.training.recorder import RunFolder
+from gacrl.training.trainer import Trainer, TrainState
+from gacrl.types import Learner
+
+SHOWN_EPISODES = 4
+"""Episodes that a run keeps, and shows in its GIF."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that has come to an end, planned or not."""
+
+    folder: Path
+    config: RunConfig
+    env_steps: int
+    summary: dict[str, Any] | None
+    """The content of `summary.json`; None where the run was stopped before its end."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is going to be: known before anything is allocated or compiled."""
+
+    parameters: int
+    """Numbers that a seed's network learns."""
+    bytes_per_seed: int
+    """Memory of a seed's training state (networks, optimiser, replay, environments)."""
+    devices: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Watcher:
+    """What a run tells whoever looks on, and asks: all of it optional."""
+
+    planned: Callable[[RunFolder, RunConfig, Plan], None] = lambda folder, config, plan: None
+    compiling: Callable[[], None] = lambda: None
+    progress: Callable[[Progress], None] = lambda progress: None
+    finishing: Callable[[], None] = lambda: None
+    warn: Callable[[str], None] = lambda sentence: None
+    stop: Callable[[], bool] = lambda: False
+
+
+def build(config: RunConfig) -> Trainer:
+    """The compiled functions that train this configuration."""
+    env = envs.make(config.env)
+    horizon = config.evaluation.horizon
+    return Trainer(
+        algorithm=algorithms.make(config.algorithm, env),
+        env=env,
+        curriculum=curriculum.make(config.curriculum, config.env),
+        num_envs=config.training.num_envs,
+        num_steps=config.training.num_steps,
+        num_seeds=config.num_seeds,
+        evaluation_env=env if horizon is None else replace(env, max_cycles=horizon),
+    )
+
+
+def plan(trainer: Trainer, config: RunConfig) -> Plan:
+    """Count what a run needs, without allocating it."""
+    member = _member_shapes(trainer)
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
+    network = getattr(member.learner, "network", ())
+    return Plan(
+        parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
+        bytes_per_seed=size,
+        devices=tuple(f"{device.platform}:{device.id}" for device in devices_for(config.num_seeds)),
+    )
+
+
+def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
+    """Train from the beginning, into a new run folder."""
+    folder = RunFolder.create(out, config)
+    with folder.locked():
+        return _run(folder, config, None, watcher or Watcher())
+
+
+def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
+    """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
+    watcher = watcher or Watcher()
+    folder = RunFolder.open(path)
+    with folder.locked():
+        config = folder.config()
+        fingerprint = configuration.fingerprint(config)
+        found: checkpoint.Checkpoint | None = None
+        if any(folder.checkpoints.glob("step-*")):
+            found, warnings = checkpoint.newest(folder.checkpoints)
+            for warning in warnings:
+                watcher.warn(warning)
+            if found.fingerprint != fingerprint:
+                raise UserError(
+                    f"{found.folder} was trained with other settings than {folder.config_file} now says: "
+                    "put the file back as it was, or train into a new folder"
+                )
+        if extend is not None:
+            steps = config.training.env_steps + extend
+            config = replace(config, training=replace(config.training, env_steps=steps))
+            folder.write_config(config)
+        return _run(folder, config, found, watcher)
+
+
+def _run(folder: RunFolder, config: RunConfig, found: checkpoint.Checkpoint | None, watcher: Watcher) -> Run:
+    trainer = build(config)
+    watcher.planned(folder, config, plan(trainer, config))
+    try:
+        if found is None:
+            folder.forget_metrics_after(0)
+            env_steps, clock, state = 0, Clock(), trainer.init(config.seeds)
+        else:
+            folder.forget_metrics_after(found.env_steps)
+            env_steps, clock = found.env_steps, Clock(**found.counters)
+            state = shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
+        for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
+            env_steps, state, clock = progress.env_steps, progress.state, progress.clock
+            folder.append_metrics(list(progress.rows))
+            checkpoint.save(
+                folder.checkpoints,
+                without_padding(state, config.num_seeds),
+                env_steps,
+                configuration.fingerprint(config),
+                vars(clock),
+            )
+            watcher.progress(progress)
+            if watcher.stop() and not progress.done:
+                return Run(folder.path, config, env_steps, None)
+        watcher.finishing()
+        summary = _finish(folder, config, trainer, state, env_steps, clock)
+    except OSError as error:
+        raise UserError(
+            f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
+            f"then `gacrl resume {folder.path}` goes on from the last checkpoint"
+        ) from error
+    return Run(folder.path, config, env_steps, summary)
+
+
+def _finish(
+    folder: RunFolder, config: RunConfig, trainer: Trainer, state: TrainState, env_steps: int, clock: Clock
+) -> dict[str, Any]:
+    """The closing evaluation, some episodes to look at, and the summary."""
+    num_episodes = config.evaluation.final_episodes
+    env = trainer.evaluation_env
+    final = {
+        kind: jax.device_get(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes))
+        for kind in ("greedy", "sampled")
+    }
+    references = evaluate_scripted(env, num_episodes)
+    members = len(config.seeds)
+    summary = {
+        "preset": config.preset,
+        "seeds": list(config.seeds),
+        "env_steps": env_steps,
+        "final": {
+            kind: normalised(
+                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references
+            )
+            for kind, values in final.items()
+        },
+        "references": references,
+        "episodes": num_episodes,
+        "horizon": env.max_cycles,
+        "steps_per_second": clock.steps_per_second,
+        "compile_seconds": clock.compiling,
+        "wall_seconds": clock.wall,
+        "versions": versions(),
+    }
+    folder.write_summary(summary)
+    learner = jax.tree.map(lambda leaf: leaf[0], jax.device_get(state.learner))
+    policy = trainer.algorithm.policy(learner, False)
+    shown = episodes.record_many(
+        env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
+    )
+    for number, episode in enumerate(shown):
+        episode.save(folder.episodes / f"{number}.npz")
+    render.gif(shown, folder.gif, title=f"{config.preset}, seed {config.seed}")
+    return summary
+
+
+def evaluate_scripted(env: envs.Spread, num_episodes: int) -> dict[str, dict[str, float]]:
+    """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
+
+    def mean_metrics(name: str) -> dict[str, float]:
+        actor = scripted.make(name, env)
+        metrics = jax.jit(
+            lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
+        )(env.default_params(), stream_key("report"))
+        return {metric: float(np.mean(values)) for metric, values in metrics.items()}
+
+    return {name: mean_metrics(name) for name in scripted.SCRIPTED}
+
+
+def versions() -> dict[str, str]:
+    """What produced a run: packages, Python, and the commit where the source is a git checkout."""
+    packages = ("gacrl", "jax", "jaxlib", "equinox", "optax", "numpy", "mpe2")
+    found = {name: metadata.version(name) for name in packages}
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return {**found, "python": platform.python_version()}
+    commit = {"git_commit": done.stdout.strip()} if done.returncode == 0 else {}
+    return {**found, "python": platform.python_version(), **commit}
+
+
+def _member_shapes(trainer: Trainer) -> TrainState:
+    return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
+
+
+def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
+    """The learners of a checkpoint, stacked and laid out for the trainer."""
+    learners = checkpoint.load(found, _stacked_shapes(trainer).learner, prefix=".learner")
+    return shard_seeds(learners, trainer.num_seeds)
+
+
+def _stacked_shapes(trainer: Trainer) -> TrainState:
+    """The shapes of the training state of all seeds, as a checkpoint holds it."""
+    seeds = tuple(range(trainer.num_seeds))
+    return jax.eval_shape(lambda: trainer.init_stacked(seeds))
