@@ -9,7 +9,7 @@ from gacrl import envs
 from gacrl.config import EnvConfig, RunConfig
 from gacrl.envs.spread import Spread
 from gacrl.training import session
-from gacrl.training.devices import prepare_cpu
+from gacrl.training.devices import prepare_jax
 from gacrl.training.session import Run, Watcher
 
 
@@ -24,9 +24,9 @@ def train(
     config: the default preset where none is given. seed: replaces the configuration's. out: the run folder,
     by default the next free one under `runs/`. Raises UserError (ConfigError for settings) with one sentence.
     """
-    prepare_cpu()
     config = configuration.preset() if config is None else config
     config = config if seed is None else replace(config, seed=seed)
+    prepare_jax(config.num_seeds)
     return session.start(config, None if out is None else Path(out), watcher)
 
 

@@ -84,8 +84,9 @@ def _train(words: list[str]) -> int:
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def start(watcher: "Watcher") -> "Run":
-        from gacrl.training import session
+        from gacrl.training import devices, session
 
+        devices.prepare_jax(config.num_seeds)
         return session.start(config, asked.out, watcher)
 
     return _watched(start, asked.json)
@@ -99,8 +100,9 @@ def _resume(words: list[str]) -> int:
         raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
 
     def resume(watcher: "Watcher") -> "Run":
-        from gacrl.training import session
+        from gacrl.training import devices, recorder, session
 
+        devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
         return session.resume(asked.run, asked.extend, watcher)
 
     return _watched(resume, asked.json)
@@ -111,9 +113,6 @@ def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
     from gacrl.progress import TerminalWatcher
 
     with TerminalWatcher() as terminal, _stopping(terminal):
-        from gacrl.training.devices import prepare_cpu
-
-        prepare_cpu()
         run = work(terminal.watcher())
     terminal.report(run)
     if as_json:
@@ -156,9 +155,9 @@ def _evaluate(words: list[str]) -> int:
     asked = arguments.parse(arguments.Evaluate, words, "evaluate")
     if asked.episodes < 1:
         raise UserError(f"--episodes must be at least 1, not {asked.episodes}")
-    from gacrl.training.devices import prepare_cpu
+    from gacrl.training.devices import prepare_jax
 
-    prepare_cpu()
+    prepare_jax()
     from gacrl.experiments import scoring
     from gacrl.progress import print_evaluation
 
@@ -187,9 +186,9 @@ def _render(words: list[str]) -> int:
         raise UserError(f"{asked.out} exists: choose another --out, or say --overwrite")
     if not asked.out.parent.is_dir():
         raise UserError(f"there is no folder {asked.out.parent} to write {asked.out.name} into")
-    from gacrl.training.devices import prepare_cpu
+    from gacrl.training.devices import prepare_jax
 
-    prepare_cpu()
+    prepare_jax()
     from gacrl import render
     from gacrl.experiments import scoring
 
@@ -224,9 +223,9 @@ def _doctor(words: list[str]) -> int:
     from gacrl import arguments
 
     asked = arguments.parse(arguments.Doctor, words, "doctor")
-    from gacrl.training.devices import prepare_cpu
+    from gacrl.training.devices import prepare_jax
 
-    prepare_cpu()
+    prepare_jax()
     from gacrl.doctor import examine
 
     healthy = True

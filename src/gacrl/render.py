@@ -8,7 +8,7 @@ colour-blind, and nothing is said by colour alone.
 import functools
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -43,6 +43,8 @@ _JUMP = 4.0
 """A step of this many radii is a new placement: no trail follows it."""
 _COLOURS = 96
 """Of a GIF's soft edges."""
+_SAMPLES = 8
+"""Frames that a GIF's palette is made from."""
 _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 """How long an episode's first and last frame stay."""
 
@@ -61,17 +63,22 @@ def gif(
         raise ValueError("a GIF needs at least one episode")
     if not 0 < fps <= 50:
         raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
-    count = len(episodes)
-    pictures = [
-        _Picture(episode, size, title, f"episode {k} of {count}" if count > 1 else "")
-        for k, episode in enumerate(episodes, 1)
-    ]
-    moments = [(picture, t) for picture in pictures for t in range(picture.episode.num_steps + 1)]
+    every = -(-sum(episode.num_steps + 1 for episode in episodes) // _SAMPLES)
+
+    def drawn(step: int = 1) -> Iterator[Image.Image]:
+        """Every `step`-th frame of all episodes."""
+        moment = 0
+        for k, episode in enumerate(episodes, 1):
+            note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
+            picture = _Picture(episode, size, title, note)
+            for t in range(episode.num_steps + 1):
+                if moment % step == 0:
+                    yield picture.draw(t)
+                moment += 1
+
     with written_whole(path) as file:
-        palette = _palette([picture.draw(t) for picture, t in moments[:: -(-len(moments) // 8)]])
-        frames = (
-            picture.draw(t).quantize(palette=palette, dither=Image.Dither.NONE) for picture, t in moments
-        )
+        palette = _palette(drawn(every))
+        frames = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn())
         colours = palette.getpalette() or []
         next(frames).save(
             file,
@@ -100,11 +107,11 @@ def _durations(num_steps: int, fps: int | float) -> list[int]:
     return [first, *[usual] * (num_steps - 1), last]
 
 
-def _palette(samples: Sequence[Image.Image]) -> Image.Image:
+def _palette(samples: Iterable[Image.Image]) -> Image.Image:
     """One palette for all frames: the colours of surfaces exactly, those of their soft edges nearly.
 
-    Few colours make a small file. Pillow looks for the nearest one on a grid of 4 levels: none may be closer
-    than that to another.
+    Few colours make a small file. Pillow looks the nearest one up on a coarse grid, so they keep apart: a
+    surface would take on the colour of its edge.
     """
     counts: Counter[tuple[int, ...]] = Counter()
     for sample in samples:

@@ -9,11 +9,11 @@ A container is written for one environment at one step; `rollout` puts [T, E] in
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 PRNGKey: TypeAlias = Key[Array, ""]
-Memory: TypeAlias = PyTree[Array]
-"""What a policy carries from step to step: `()` when feed-forward, a recurrent carry otherwise."""
+Memory: TypeAlias = Any
+"""A pytree: what a policy carries from step to step: `()` when feed-forward, a recurrent carry otherwise."""
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Named scalars of one step or one update."""
 
@@ -44,8 +44,8 @@ class Decision(NamedTuple):
     """What each agent sent; rows of a padded agent are 0."""
     adjacency: Bool[Array, "*b N N"] | None = None
     """Entry [i, j]: j's message reaches i."""
-    extras: PyTree[Array] = ()
-    """The algorithm's own: value, log-probability, the noise that shaped the decision."""
+    extras: Any = ()
+    """The algorithm's own, any pytree: value, log-probability, the noise that shaped the decision."""
 
 
 class Transition(NamedTuple):

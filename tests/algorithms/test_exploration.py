@@ -73,4 +73,4 @@ def test_environments_side_by_side_count_by_their_mean():
     np.testing.assert_allclose(seen.signal("episode_so_far"), 0.5)
     seen = follow_coverage(seen, jnp.array([1.0, 1.0]), jnp.array([True, True]))
     np.testing.assert_allclose(seen.signal("last_episode"), 0.75)
-    assert int(seen.episode) == 1
+    assert (int(seen.episode), int(seen.steps)) == (2, 0)

@@ -329,7 +329,7 @@ def test_loss_and_gradient_are_the_papers(config):
 
 
 def test_policy_loss_by_hand():
-    """(18) with B = 2, N = 2. Replayed: mean of -(-2 - 4)/2 · 2 = 6 and -(-1 - 1)/2 · -3 = -3; now 0.5 · 4."""
+    """(18), B = N = 2. Replayed: the mean of -(-2 - 4)/2 · 2 = 6 and -(-1 - 1)/2 · -3 = -3. Now: 0.5 · 4."""
     log_pi = jnp.array([[-2.0, -1.0, -0.25], [-4.0, -1.0, -0.75]])
     reward = jnp.array([2.0, -3.0, 4.0])
     np.testing.assert_allclose(gacrl_paper.policy_loss(log_pi, reward, 2), (6 - 3) / 2 + 2, rtol=1e-6)
@@ -561,20 +561,59 @@ def test_an_update_is_one_step_of_adam(updates):
     """At 0.0005 - episode · 0.0004/1500, on the summed loss, with the weights of the moment."""
     moments = {}
     for t, episode in enumerate([749, 749, 750]):
-        before, after = updates.learners[t], updates.learners[t + 1]
         rows, temperature, noise = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), updates.seen[t])
-        (_, parts), gradient = GRADIENT(before.network, ALGORITHM.hyper, rows, temperature, noise, CONFIG)
-        learning_rate = 0.0005 - episode * 0.0004 / 1500
-        expected = paper_adam(
-            paper_weights(before.network), paper_weights(gradient), moments, t + 1, learning_rate
-        )
-        learnt = paper_weights(after.network)
-        for name, values in expected.items():
-            np.testing.assert_allclose(
-                learnt[name], values, atol=1e-3 * learning_rate, rtol=1e-6, err_msg=name
-            )
+        network = updates.learners[t].network
+        (_, parts), gradient = GRADIENT(network, ALGORITHM.hyper, rows, temperature, noise, CONFIG)
         for name, value in parts.items():
             np.testing.assert_allclose(updates.metrics[t][name], value, rtol=1e-5, err_msg=name)
+
+        before, after = paper_weights(network), paper_weights(updates.learners[t + 1].network)
+        learning_rate = 0.0005 - episode * 0.0004 / 1500
+        expected = paper_adam(before, paper_weights(gradient), moments, t + 1, learning_rate)
+        along = length = 0.0
+        for name, values in expected.items():
+            np.testing.assert_allclose(after[name], values, atol=2e-3 * learning_rate, rtol=0, err_msg=name)
+            along += ((after[name] - before[name]) * (values - before[name])).sum()
+            length += ((values - before[name]) ** 2).sum()
+        assert abs(along / length - 1) < 1e-4  # the rates of neighbouring episodes differ by 9e-4
+
+
+def test_environments_side_by_side_share_one_coverage(monkeypatch):
+    """Two environments, two steps, a stand-in loss: four gradient steps, two episodes of mean coverage 5/12.
+
+    Coverage is 1/3 and 2/3 at first, 0 and 2/3 in the step that ends both episodes.
+    """
+    monkeypatch.setattr(
+        gacrl_paper,
+        "loss",
+        lambda network, *rest: (network.critic.w8.bias.sum(), {"loss": rest[1].reward[-1]}),
+    )
+    learner = fixed_learner()
+    learner = learner._replace(
+        replay=replay.empty(jax.tree.map(lambda leaf: leaf[0], learner.replay.items), 9)
+    )
+    decision = jax.tree.map(
+        lambda leaf: leaf[:4].reshape(2, 2, *leaf.shape[1:]), ACT(learner, observe(), KEYS)
+    )
+    observation = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 2, *leaf.shape)), observe())
+    ends = jnp.array([[False, False], [True, True]])
+    steps = Transition(
+        observation=observation,
+        decision=decision,
+        reward=jnp.broadcast_to(jnp.array([[1.0, 2.0], [3.0, 4.0]])[..., None], (2, 2, N)),
+        terminated=ends & False,
+        truncated=ends,
+        first=~ends,
+        next_observation=observation,
+        info={"coverage_theta": jnp.array([[1 / 3, 2 / 3], [0.0, 2 / 3]])},
+    )
+    after, metrics = jax.jit(ALGORITHM.update)(learner, Rollout(steps, (), ()), jax.random.key(0))
+    np.testing.assert_array_equal(after.replay.items.reward, [1, 2, 3, 4, 0, 0, 0, 0, 0])
+    assert int(after.optimizer.count) == 4
+    assert metrics["loss"] == 2.5
+    np.testing.assert_allclose(metrics["epsilon"], 0.3 + 0.2 * (1 + 0.5) / 2, rtol=1e-6)
+    assert (int(after.coverage.episode), int(after.coverage.steps)) == (2, 0)
+    np.testing.assert_allclose(after.coverage.last_episode, 5 / 12, rtol=1e-6)
 
 
 # The task grows harder.

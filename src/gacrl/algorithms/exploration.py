@@ -61,7 +61,8 @@ def no_coverage() -> Coverage:
 def follow_coverage(past: Coverage, coverage: Float[Array, " E"], done: Bool[Array, " E"]) -> Coverage:
     """Take in one step of E environments that keep time together (the paper has one).
 
-    The mean over the environments counts; an episode ends when any environment's does.
+    The mean over the environments counts, and starts anew when any environment's episode ends. Every
+    finished episode is counted.
     """
     total, steps = past.total + coverage.mean(), past.steps + 1
     over = done.any()
@@ -69,5 +70,5 @@ def follow_coverage(past: Coverage, coverage: Float[Array, " E"], done: Bool[Arr
         total=jnp.where(over, 0.0, total),
         steps=jnp.where(over, 0, steps),
         last_episode=jnp.where(over, total / steps, past.last_episode),
-        episode=past.episode + over,
+        episode=past.episode + done.sum(),
     )

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.algorithm import Algorithm
@@ -407,28 +407,34 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             hyper.learning_rate, hyper.learning_rate_end, learner.coverage.episode, hyper.num_episodes
         )
         network = jax.tree.map(lambda w, d: w - learning_rate * d, learner.network, directions)
-        coverage = step.info.get("coverage_theta", jnp.zeros(()))
-        done = step.terminated | step.truncated
-        learner = learner._replace(
-            network=network,
-            optimizer=optimizer,
-            replay=replay,
-            coverage=follow_coverage(learner.coverage, coverage[None], done[None]),
-        )
+        learner = learner._replace(network=network, optimizer=optimizer, replay=replay)
         return learner, {**losses, "epsilon": epsilon, "temperature": temperature}
 
     def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
         """One gradient step per environment step, in the order in which they were taken."""
         time, environments = rollout.transitions.reward.shape[:2]
-        steps = jax.tree.map(
-            lambda leaf: leaf.reshape(time * environments, *leaf.shape[2:]), rollout.transitions
-        )
-        if time * environments == 1:
-            return learn_from_step(learner, jax.tree.map(lambda leaf: leaf[0], steps), key)
-        keys = jax.random.split(key, time * environments)
-        learner, metrics = jax.lax.scan(
-            lambda learner, inputs: learn_from_step(learner, *inputs), learner, (steps, keys)
-        )
+
+        def learn_from_steps(
+            learner: LearnerState, inputs: tuple[Transition, Key[Array, " E"]]
+        ) -> tuple[LearnerState, Metrics]:
+            """What E environments did at one time; coverage moves on when all of it is learned from."""
+            steps = inputs[0]
+            if environments == 1:
+                learner, metrics = learn_from_step(learner, *jax.tree.map(lambda leaf: leaf[0], inputs))
+            else:
+                learner, metrics = jax.lax.scan(
+                    lambda learner, inputs: learn_from_step(learner, *inputs), learner, inputs
+                )
+                metrics = jax.tree.map(lambda values: values.mean(0), metrics)
+            done = steps.terminated | steps.truncated
+            coverage = steps.info.get("coverage_theta", jnp.zeros(done.shape))
+            return learner._replace(coverage=follow_coverage(learner.coverage, coverage, done)), metrics
+
+        single = time * environments == 1
+        keys = key[None, None] if single else jax.random.split(key, (time, environments))
+        if time == 1:
+            return learn_from_steps(learner, jax.tree.map(lambda leaf: leaf[0], (rollout.transitions, keys)))
+        learner, metrics = jax.lax.scan(learn_from_steps, learner, (rollout.transitions, keys))
         return learner, jax.tree.map(lambda values: values.mean(0), metrics)
 
     return Algorithm(init, lambda num_agents: (), policy, update, hyper)

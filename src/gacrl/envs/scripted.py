@@ -1,10 +1,9 @@
 """Policies that learn nothing: two floors, `random` and `noop`, and a ceiling, `oracle`.
 
-The oracle reads the exact state, whatever the agents themselves observe. At an episode's start it assigns
-agents to landmarks at the least total squared distance. Then every agent takes the push after which it
-would coast nearest to its target, and counts coming too close to another agent as distance. Targets are
-adjusted so that there is room for everyone: two agents cannot stand on two landmarks closer than their discs
-are wide. The oracle is a strong heuristic and no optimum: a learned policy may beat it.
+The oracle reads the exact state, whatever the agents themselves observe. It assigns agents to landmarks once
+per episode, at the least total squared distance. Then each agent takes the push after which it would coast
+nearest to its target, where crowding another agent counts as distance. Targets leave room for two discs, which
+landmarks need not. It is a strong heuristic and no optimum: a learned policy may beat it.
 """
 
 from typing import NamedTuple
@@ -16,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.assignment import assign
 from gacrl.envs.particles import DIRECTIONS, Physics, pairwise_offsets
-from gacrl.envs.spread import CAPTURE_RADIUS, Spread, SpreadState, reflect, unpack_state
+from gacrl.envs.spread import CAPTURE_RADIUS, Spread, SpreadParams, SpreadState, reflect, unpack_state
 from gacrl.types import Channel, Decision, Memory, Observation, Policy, PRNGKey
 
 SCRIPTED = ("random", "noop", "oracle")
@@ -46,18 +45,12 @@ def make(name: str, env: Spread) -> Scripted:
 
     Raises ValueError for an unknown name.
     """
-    match name:
-        case "random":
-            return Scripted(_random(env), ())
-        case "noop":
-            return Scripted(_noop(env), ())
-        case "oracle":
-            return Scripted(_oracle(env), jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
-        case _:
-            raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(SCRIPTED)}.")
+    if name not in SCRIPTED:
+        raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(SCRIPTED)}.")
+    return {"random": _random, "noop": _noop, "oracle": _oracle}[name](env)
 
 
-def _random(env: Spread) -> Policy:
+def _random(env: Spread) -> Scripted:
     """Every action of the action space is equally likely."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
@@ -66,21 +59,22 @@ def _random(env: Spread) -> Policy:
             return Decision(jax.random.uniform(key, shape)), memory
         return Decision(jax.random.randint(key, shape[:1], 0, env.num_actions)), memory
 
-    return policy
+    return Scripted(policy, ())
 
 
-def _noop(env: Spread) -> Policy:
+def _noop(env: Spread) -> Scripted:
     """Nobody ever pushes."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         return Decision(_as_action(jnp.zeros((env.num_agents, 2)), env.continuous_actions)), memory
 
-    return policy
+    return Scripted(policy, ())
 
 
-def _oracle(env: Spread) -> Policy:
+def _oracle(env: Spread) -> Scripted:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
-    physics, arena_scale = env.initial_params.physics, env.initial_params.arena_scale
+    params = env.initial_params
+    physics = params.physics
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         if observation.state is None:
@@ -89,33 +83,31 @@ def _oracle(env: Spread) -> Policy:
         agents = observation.agent_mask
         posts, wanted = _posts(state, observation.landmark_mask)
 
-        def assign_agents(_: Int[Array, " N"]) -> Int[Array, " N"]:
-            meeting = jax.vmap(_intercept, (0, None, None, None, None))(
-                state.positions[:, None], posts, state.landmark_velocities, arena_scale, physics
-            )
-            squares = jnp.square(meeting - state.positions[:, None]).sum(-1)
-            return assign(jnp.where(agents[:, None] & wanted[None, :], squares, jnp.inf))
+        def assign_agents(memory: Int[Array, " N"]) -> Int[Array, " N"]:
+            origins, velocities = state.positions[:, None], state.landmark_velocities
+            meeting = jax.vmap(_intercept, (0, None, None, None))(origins, posts, velocities, params)
+            squares = jnp.square(_length(meeting - origins))
+            possible = (agents & (memory == UNASSIGNED))[:, None] & wanted[None, :]
+            return assign(jnp.where(possible, squares, jnp.inf))
 
-        # A loop that runs once at most: mapped over environments, `cond` would compute both of its branches
-        # in every step, while a loop ends at once where all environments are assigned.
+        # A loop that runs once at most, and whose body depends on the memory. Mapped over environments, `cond`
+        # would assign in every step and then select; and from a constant body XLA moves the work out.
         landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
 
         free = ~(agents & (landmark >= 0) & wanted[landmark])
         coasting, reach = _coast(state, physics)
-        target = _intercept(
-            coasting, posts[landmark], state.landmark_velocities[landmark], arena_scale, physics
-        )
+        target = _intercept(coasting, posts[landmark], state.landmark_velocities[landmark], params)
         target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
 
         pushes = _pushes((target - coasting) / reach, env.continuous_actions)
         outcomes = coasting[:, None] + reach * pushes
-        distance = jnp.sqrt(jnp.square(outcomes - target[:, None]).sum(-1))
+        distance = _length(outcomes - target[:, None])
         # The others are expected where each would go if it were alone.
         expected = _row_choice(outcomes, distance.argmin(axis=1))
         choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
         return Decision(_as_action(_row_choice(pushes, choice), env.continuous_actions)), landmark
 
-    return policy
+    return Scripted(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
 
 
 def _posts(
@@ -141,14 +133,13 @@ def _intercept(
     agents: Float[Array, "#M 2"],
     posts: Float[Array, "M 2"],
     velocities: Float[Array, "M 2"],
-    arena_scale: Float[Array, ""] | float,
-    physics: Physics,
+    params: SpreadParams,
 ) -> Float[Array, "M 2"]:
     """Where agents at top speed meet their moving posts, no sooner than `_coast` looks ahead."""
     meeting = posts
-    for _ in range(2):  # time from place and place from time, once more
-        time = jnp.sqrt(jnp.square(meeting - agents).sum(-1)) / physics.top_speed + 3 * physics.time_step
-        meeting, _ = reflect(posts + time[:, None] * velocities, velocities, arena_scale)
+    for _ in range(2):  # time from place, place from time, and once more
+        time = _length(meeting - agents) / params.physics.top_speed + 3 * params.physics.time_step
+        meeting, _ = reflect(posts + time[:, None] * velocities, velocities, params.arena_scale)
     return meeting
 
 
@@ -160,7 +151,7 @@ def _make_room(
     room = 2 * (physics.agent_radius + physics.contact_margin)
     overlap = jnp.where(_pairs(agent_mask), jnp.maximum(room - distance, 0.0), 0.0)
     shift = -(offsets * (overlap / 2 / jnp.maximum(distance, 1e-6))[..., None]).sum(1)
-    length = jnp.maximum(jnp.sqrt(jnp.square(shift).sum(-1)), 1e-6)
+    length = jnp.maximum(_length(shift), 1e-6)
     return targets + shift * jnp.minimum(1.0, jnp.where(free, jnp.inf, SHIFT) / length)[:, None]
 
 
@@ -183,13 +174,13 @@ def _pushes(exact: Float[Array, "N 2"], continuous: bool) -> Float[Array, "N C 2
 
 
 def _crowding(
-    outcomes: Float[Array, "N C 2"],
-    expected: Float[Array, "N 2"],
+    places: Float[Array, "N C 2"],
+    others: Float[Array, "N 2"],
     agent_mask: Bool[Array, " N"],
     physics: Physics,
 ) -> Float[Array, "N C"]:
-    """How deep each outcome is inside the discs and the elbow room of the other agents, summed over them."""
-    distance = jax.vmap(lambda places: pairwise_offsets(places, expected)[1])(outcomes)
+    """How far each place is inside the discs and the elbow room of the other agents, summed over them."""
+    distance = _length(places[:, :, None] - others[None, None])
     depth = jnp.maximum(2 * physics.agent_radius + ELBOW_ROOM - distance, 0.0)
     return jnp.where(_pairs(agent_mask)[:, None], depth, 0.0).sum(-1)
 
@@ -207,3 +198,8 @@ def _pairs(mask: Bool[Array, " M"]) -> Bool[Array, "M M"]:
 
 def _row_choice(options: Float[Array, "N C 2"], choice: Int[Array, " N"]) -> Float[Array, "N 2"]:
     return jnp.take_along_axis(options, choice[:, None, None], axis=1)[:, 0]
+
+
+def _length(vectors: Float[Array, "*b 2"]) -> Float[Array, "*b"]:
+    """Written out, because XLA does not vectorise a sum over so short an axis on CPUs (50 times slower)."""
+    return jnp.sqrt(jnp.square(vectors[..., 0]) + jnp.square(vectors[..., 1]))

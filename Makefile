@@ -1,0 +1,35 @@
+# Two commands for a fresh machine with Python >= 3.11 and make: `make train` and `make test`.
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: train test soak lint types bench clean
+
+train: $(STAMP)  ## a short run of the default preset: where its summary and GIF lie is printed at the end
+	"$(BIN)/gacrl" train --env-steps 15000
+
+test: $(STAMP)
+	"$(BIN)/python" -m pytest -n 2 --dist loadgroup
+
+soak: $(STAMP)  ## what is too slow for every change
+	"$(BIN)/python" -m pytest -m soak
+
+lint: $(STAMP)
+	"$(BIN)/ruff" check .
+	"$(BIN)/ruff" format --check .
+
+types: $(STAMP)
+	"$(BIN)/pyright"
+
+bench: $(STAMP)  ## side by side with a plain PyTorch program, in an environment of its own
+	"$(BIN)/python" benchmarks/paper_schedule.py
+
+$(STAMP): pyproject.toml
+	"$(PYTHON)" -c 'import sys; sys.exit("gacrl needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
+	"$(PYTHON)" -m venv .venv
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	touch "$@"
+
+clean:
+	rm -rf .venv
