@@ -22,8 +22,7 @@ def world(positions, landmarks, steps=3, symbols=None, hears=None, **changes) ->
     """An episode in which nothing moves, unless there are rows for every step."""
     positions, landmarks = (np.asarray(rows, float) for rows in (positions, landmarks))
     positions, landmarks = (
-        np.repeat(rows[None], steps + 1, axis=0) if rows.ndim == 2 else rows
-        for rows in (positions, landmarks)
+        np.repeat(rows[None], steps + 1, axis=0) if rows.ndim == 2 else rows for rows in (positions, landmarks)
     )
     agents = positions.shape[1]
     messages = None if symbols is None else np.eye(64)[np.repeat([symbols], steps, axis=0)]

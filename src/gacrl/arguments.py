@@ -6,7 +6,7 @@ import io
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -152,19 +152,14 @@ class Doctor:
     """Make the last line of the output one JSON object."""
 
 
-def parse(
-    kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None
-) -> Arguments:
+def parse(kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None) -> Arguments:
     """The arguments by their dataclass. Raises UserError with one sentence for what cannot be understood."""
+    given: dict[str, Any] = {} if default is None else {"default": default}
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                kind,
-                prog=f"gacrl {command}",
-                args=words,
-                **({} if default is None else {"default": default}),
-                config=(tyro.conf.AvoidSubcommands,),
+                kind, prog=f"gacrl {command}", args=words, config=(tyro.conf.AvoidSubcommands,), **given
             )
     except SystemExit as stop:
         if stop.code == 0:

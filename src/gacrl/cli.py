@@ -7,7 +7,7 @@ import contextlib
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,7 +121,7 @@ def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
 
 
 @contextlib.contextmanager
-def _stopping(terminal: "TerminalWatcher") -> Iterator[None]:
+def _stopping(terminal: "TerminalWatcher") -> Generator[None]:
     """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
 
     def handler(number: int, frame: Any) -> None:

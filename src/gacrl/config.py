@@ -231,7 +231,7 @@ class RunConfig:
         _between("run", self, 0, 2**31 - 1, "seed")
         _between("run", self, 1, 10_000, "num_seeds")
         _require(
-            not (self.env.continuous_actions and isinstance(self.algorithm, GacrlPaperConfig)),
+            not (self.env.continuous_actions and self.algorithm.name == GacrlPaperConfig.name),
             "the paper's GACRL needs discrete actions: leave env.continuous_actions at False",
         )
 
@@ -368,9 +368,7 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
     """The value as the type that the setting has; JSON has no tuples, and writes 1 for 1.0."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
-        _require(
-            value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}"
-        )
+        _require(value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
         return value
     if origin is tuple and isinstance(value, list | tuple):
         inner = arguments[0]
@@ -385,9 +383,7 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
         return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(
-        hint, str(hint)
-    )
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
     matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
     _require(matches, f"{where} must be {wanted}, not {value!r}")
     return value

@@ -58,7 +58,7 @@ def open_run(
     folder = RunFolder.open(path)
     config = folder.config()
     changed = replace(config, env=change(config.env), evaluation=replace(config.evaluation, horizon=None))
-    if isinstance(config.algorithm, GacrlPaperConfig) and changed.env.num_agents != config.env.num_agents:
+    if config.algorithm.name == GacrlPaperConfig.name and changed.env.num_agents != config.env.num_agents:
         raise UserError(
             f"{path} was trained with {config.env.num_agents} agents, and the paper's GACRL is built for their "
             "number (equation (10) puts all messages side by side): leave --num-agents out"

@@ -66,9 +66,7 @@ class TerminalWatcher:
         env, say = config.env, self._console.print
         seeds = ", ".join(str(seed) for seed in config.seeds)
         say(f"run        {folder.path}")
-        say(
-            f"task       {env.name}: {env.num_agents} agents, {env.landmarks} landmarks, {env.max_cycles} steps"
-        )
+        say(f"task       {env.name}: {env.num_agents} agents, {env.landmarks} landmarks, {env.max_cycles} steps")
         say(f"preset     {config.preset} ({config.algorithm.name}), {plan.parameters:,} parameters")
         say(f"seeds      {seeds} on {', '.join(plan.devices)}")
         say(
@@ -135,7 +133,8 @@ class TerminalWatcher:
             )
             for row in rows:
                 cells = [
-                    _cell(row.mean.get(name), row.sd and row.sd.get(name)) for name in paper_tables.COLUMNS
+                    _cell(row.mean.get(name), row.sd.get(name) if row.sd else None)
+                    for name in paper_tables.COLUMNS
                 ]
                 end = row.who == "oracle"
                 table.add_row(str(row.episode), row.who, *cells, end_section=end)
@@ -163,7 +162,9 @@ class _Line:
         full = round(20 * self.fraction)
         bar = "━" * full + "╌" * (20 - full)
         seconds = time.monotonic() - self._begun
-        return Text.assemble(self._spinner.render(time.monotonic()), f" {bar} {self.text}  [{seconds:.0f} s]")
+        line = Text(f" {bar} {self.text}  [{seconds:.0f} s]")
+        spinning = self._spinner.render(time.monotonic())
+        return Text.assemble(spinning, line) if isinstance(spinning, Text) else line
 
 
 def describe(progress: Progress, episode: int) -> str:

@@ -51,9 +51,7 @@ _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 _Point: TypeAlias = tuple[float, float]
 
 
-def gif(
-    episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | float = 10, title: str = ""
-) -> None:
+def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | float = 10, title: str = "") -> None:
     """Write the episodes, one after the other, as an animated GIF that is `size` pixels wide.
 
     Raises OSError where the file cannot be written, ValueError without episodes or for an impossible size or

@@ -56,9 +56,7 @@ def step(
         )
         fresh = (*env.reset(reset_key, params), initial_memory)
         going_on = (env_state, after.observation, memory)
-        env_state, observation, memory = jax.tree.map(
-            lambda new, old: jnp.where(done, new, old), fresh, going_on
-        )
+        env_state, observation, memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, going_on)
         return Carry(env_state, observation, memory, done), transition
 
     return jax.vmap(one)(carry, jax.random.split(key, carry.first.shape[0]))

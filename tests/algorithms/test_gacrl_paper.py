@@ -417,9 +417,7 @@ def test_actions_are_as_frequent_as_the_mixture_says():
 
 def test_greedy_policy_draws_nothing():
     learner, observation = fixed_learner(), observe()
-    greedy = jax.jit(
-        jax.vmap(lambda key: ALGORITHM.policy(learner, False)((), observation, key, Channel())[0])
-    )
+    greedy = jax.jit(jax.vmap(lambda key: ALGORITHM.policy(learner, False)((), observation, key, Channel())[0]))
     decision = greedy(KEYS[:2])
     jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf[0], leaf[1]), decision)
     assert set(decision.extras) == {"value"}
@@ -589,12 +587,8 @@ def test_environments_side_by_side_share_one_coverage(monkeypatch):
         lambda network, *rest: (network.critic.w8.bias.sum(), {"loss": rest[1].reward[-1]}),
     )
     learner = fixed_learner()
-    learner = learner._replace(
-        replay=replay.empty(jax.tree.map(lambda leaf: leaf[0], learner.replay.items), 9)
-    )
-    decision = jax.tree.map(
-        lambda leaf: leaf[:4].reshape(2, 2, *leaf.shape[1:]), ACT(learner, observe(), KEYS)
-    )
+    learner = learner._replace(replay=replay.empty(jax.tree.map(lambda leaf: leaf[0], learner.replay.items), 9))
+    decision = jax.tree.map(lambda leaf: leaf[:4].reshape(2, 2, *leaf.shape[1:]), ACT(learner, observe(), KEYS))
     observation = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 2, *leaf.shape)), observe())
     ends = jnp.array([[False, False], [True, True]])
     steps = Transition(

@@ -31,9 +31,7 @@ def crowd(seed: int, num_agents: int, num_landmarks: int, reach: float = 0.6) ->
 def still(positions, landmarks) -> SpreadState:
     """Everything at rest, so that the next step's positions are these."""
     positions, landmarks = jnp.asarray(positions, jnp.float32), jnp.asarray(landmarks, jnp.float32)
-    return SpreadState(
-        positions, jnp.zeros_like(positions), landmarks, jnp.zeros_like(landmarks), jnp.int32(0)
-    )
+    return SpreadState(positions, jnp.zeros_like(positions), landmarks, jnp.zeros_like(landmarks), jnp.int32(0))
 
 
 @functools.cache
@@ -101,9 +99,7 @@ def test_changing_a_number_never_traces_again():
     after, _ = step(state, slow)
     assert not np.array_equal(after.velocities, before.velocities)
     near, _ = step(state, numbers(env, arena_scale=0.1, landmark_speed=0.2, reset_distance=0.1))
-    assert not np.array_equal(near.landmarks, before.landmarks), (
-        "landmarks are reflected where the arena ends"
-    )
+    assert not np.array_equal(near.landmarks, before.landmarks), "landmarks are reflected where the arena ends"
     assert len(traces) == 1
 
 
@@ -332,9 +328,7 @@ def test_collisions_can_end_the_episode(positions, collided):
     state, result = compiled(env)(still(positions, np.eye(3, 2)), jnp.zeros(3, int), KEY)
     assert bool(result.truncated) is collided and not result.terminated
     np.testing.assert_allclose(state.positions, positions, atol=1e-6)
-    _, wider = compiled(env)(
-        still(FAR, np.eye(3, 2)), jnp.zeros(3, int), KEY, numbers(env, reset_distance=0.3)
-    )
+    _, wider = compiled(env)(still(FAR, np.eye(3, 2)), jnp.zeros(3, int), KEY, numbers(env, reset_distance=0.3))
     assert bool(wider.truncated)
 
 
@@ -386,9 +380,7 @@ def transcribed(positions, landmarks, local_ratio, threshold, penalty):
     collisions = np.array([sum(d < 0.3 for d in between[i]) for i in agents])
 
     def raw(ratio, penalty):
-        return np.mean(
-            [-ratio * penalty * hits - (1 - ratio) * landmark_nearest.sum() for hits in collisions]
-        )
+        return np.mean([-ratio * penalty * hits - (1 - ratio) * landmark_nearest.sum() for hits in collisions])
 
     bonus = 10 * (1 - agent_nearest / 2) ** 2
     bonus += np.where(agent_nearest < threshold, 3 * (1 - agent_nearest / threshold), 0)

@@ -121,9 +121,7 @@ def record(
         while env.agents:
             action = draw_actions()
             before = now("p_pos"), now("p_vel"), landmarks, clock, action, raw.local_ratio
-            observations, rewards, terminations, truncations, _ = env.step(
-                dict(zip(names, action, strict=True))
-            )
+            observations, rewards, terminations, truncations, _ = env.step(dict(zip(names, action, strict=True)))
             steps.append(
                 Steps(
                     *before,

@@ -60,9 +60,7 @@ def test_gumbel_softmax_by_hand():
     np.testing.assert_allclose(gumbel_softmax(logits, noise, 2.0), [1 / 8, 2 / 8, 5 / 8], rtol=1e-6)
     # A higher temperature softens, a lower one sharpens: (0, ½ ln 2, ½ ln 5), (0, 2 ln 2, 2 ln 5).
     for temperature, weights in ((4.0, np.sqrt([1, 2, 5])), (1.0, np.array([1, 4, 25]))):
-        np.testing.assert_allclose(
-            gumbel_softmax(logits, noise, temperature), weights / weights.sum(), rtol=1e-5
-        )
+        np.testing.assert_allclose(gumbel_softmax(logits, noise, temperature), weights / weights.sum(), rtol=1e-5)
 
 
 def test_straight_through_is_one_hot_with_the_soft_gradient():

@@ -6,7 +6,7 @@ Equation (1) is in `envs.shaping`, the encoder (2)–(3) in `networks.encoder`, 
 """
 
 from math import prod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -171,8 +171,7 @@ def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*
         return jnp.zeros((0, 1))
     # Slot k holds agent k for those after it and agent k + 1 for the others.
     slots = [
-        jnp.stack([received[:, i, k + (k >= i)] for i in range(num_agents)], axis=1)
-        for k in range(num_agents - 1)
+        jnp.stack([received[:, i, k + (k >= i)] for i in range(num_agents)], axis=1) for k in range(num_agents - 1)
     ]
     return jnp.concatenate(slots)
 
@@ -265,9 +264,7 @@ def loss(
     straight_through = config.messages == "straight_through"
     columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), rows)
     output = jax.vmap(
-        lambda row, noise: forward(
-            network, row.features, row.adjacency, temperature, noise, straight_through
-        )[0],
+        lambda row, noise: forward(network, row.features, row.adjacency, temperature, noise, straight_through)[0],
         in_axes=-1,
         out_axes=-1,
     )(columns, noise)
@@ -281,14 +278,12 @@ def loss(
             mean_over_latent=config.kl_reduction == "mean",
         ),
     }
-    total = (
-        parts["loss_policy"] + hyper.critic_weight * parts["loss_critic"] + hyper.kl_weight * parts["loss_kl"]
-    )
+    total = parts["loss_policy"] + hyper.critic_weight * parts["loss_critic"] + hyper.kl_weight * parts["loss_kl"]
     return total, parts
 
 
 def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
-    """The paper's algorithm for this task's shapes. Needs discrete actions."""
+    """The paper's algorithm for this task's shapes. Needs discrete actions and a team without padding."""
     num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
     straight_through = config.messages == "straight_through"
     adam = optax.scale_by_adam()
@@ -371,16 +366,14 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
                 action = jax.random.categorical(action_key, jnp.log(probabilities))
             else:
                 action = logits.argmax(-1)
-            extras = {"value": learner.network.critic(observation.features)}
+            extras: dict[str, Any] = {"value": learner.network.critic(observation.features)}
             if noise is not None:
                 extras["noise"] = noise
             return Decision(action, output.message.T, adjacency, extras), memory
 
         return act
 
-    def learn_from_step(
-        learner: LearnerState, step: Transition, key: PRNGKey
-    ) -> tuple[LearnerState, Metrics]:
+    def learn_from_step(learner: LearnerState, step: Transition, key: PRNGKey) -> tuple[LearnerState, Metrics]:
         """Remember one step of one environment, then take one gradient step of Adam."""
         sample_key, noise_key = jax.random.split(key)
         epsilon, temperature = levels(learner)

@@ -8,9 +8,7 @@ from gacrl.envs.spread import Spread, SpreadParams
 
 def make(config: EnvConfig) -> Spread:
     """The task that the configuration names."""
-    structure = {field.name for field in dataclasses.fields(Spread)} & {
-        f.name for f in dataclasses.fields(config)
-    }
+    structure = {field.name for field in dataclasses.fields(Spread)} & {f.name for f in dataclasses.fields(config)}
     return Spread(
         **{name: getattr(config, name) for name in structure - {"num_landmarks"}},
         num_landmarks=config.landmarks,

@@ -62,7 +62,7 @@ class Probe:
         params = self.default_params() if params is None else params
         choice = 2.0 * action - 1.0  # the two actions, as −1 and 1
         is_discount = params.probe == PROBES.index("discount")
-        last = (state.clock == 1) | ~is_discount  # the others take a single step
+        last = (state.clock == 1) | jnp.logical_not(is_discount)  # the others take a single step
         reward = jnp.stack(
             [
                 jnp.ones(()),

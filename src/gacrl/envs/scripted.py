@@ -2,7 +2,7 @@
 
 The oracle reads the exact state, whatever the agents themselves observe. It assigns agents to landmarks once
 per episode, at the least total squared distance. Then each agent takes the push after which it would coast
-nearest to its target, where crowding another agent counts as distance. Targets leave room for two discs, which
+nearest to its target, where crowding another agent counts as distance. Targets leave room for two discs;
 landmarks need not. It is a strong heuristic and no optimum: a learned policy may beat it.
 """
 
@@ -38,12 +38,10 @@ class Scripted(NamedTuple):
 
 
 def make(name: str, env: Spread) -> Scripted:
-    """The scripted policy of that name (`SCRIPTED`) for this task.
+    """The scripted policy of that name for this task; ValueError for a name that is not in `SCRIPTED`.
 
     The oracle takes physics and arena scale, which no observation tells, from `env.initial_params`; masks,
     places and velocities of agents and landmarks it reads from the observation.
-
-    Raises ValueError for an unknown name.
     """
     if name not in SCRIPTED:
         raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(SCRIPTED)}.")
@@ -73,30 +71,29 @@ def _noop(env: Spread) -> Scripted:
 
 def _oracle(env: Spread) -> Scripted:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
-    params = env.initial_params
-    physics = params.physics
+    params, physics = env.initial_params, env.initial_params.physics
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         if observation.state is None:
             raise ValueError("The oracle needs an environment that puts its state into the observation.")
         state = unpack_state(observation.state, env.num_agents)
-        agents = observation.agent_mask
+        agents, motion = observation.agent_mask, state.landmark_velocities
         posts, wanted = _posts(state, observation.landmark_mask)
 
         def assign_agents(memory: Int[Array, " N"]) -> Int[Array, " N"]:
-            origins, velocities = state.positions[:, None], state.landmark_velocities
-            meeting = jax.vmap(_intercept, (0, None, None, None))(origins, posts, velocities, params)
+            origins = state.positions[:, None]
+            meeting = jax.vmap(_intercept, (0, None, None, None))(origins, posts, motion, params)
             squares = jnp.square(_length(meeting - origins))
             possible = (agents & (memory == UNASSIGNED))[:, None] & wanted[None, :]
             return assign(jnp.where(possible, squares, jnp.inf))
 
-        # A loop that runs once at most, and whose body depends on the memory. Mapped over environments, `cond`
-        # would assign in every step and then select; and from a constant body XLA moves the work out.
+        # A loop that runs once at most: mapped over environments, `cond` would assign in every step and select.
+        # The body depends on the memory, because XLA moves constant work out, in front of the loop.
         landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
 
         free = ~(agents & (landmark >= 0) & wanted[landmark])
         coasting, reach = _coast(state, physics)
-        target = _intercept(coasting, posts[landmark], state.landmark_velocities[landmark], params)
+        target = _intercept(coasting, posts[landmark], motion[landmark], params)
         target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
 
         pushes = _pushes((target - coasting) / reach, env.continuous_actions)
@@ -110,9 +107,7 @@ def _oracle(env: Spread) -> Scripted:
     return Scripted(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
 
 
-def _posts(
-    state: SpreadState, landmark_mask: Bool[Array, " L"]
-) -> tuple[Float[Array, "L 2"], Bool[Array, " L"]]:
+def _posts(state: SpreadState, landmark_mask: Bool[Array, " L"]) -> tuple[Float[Array, "L 2"], Bool[Array, " L"]]:
     """Where to stand to cover each landmark, and which landmarks want an agent of their own.
 
     Two landmarks that are each other's nearest share a post midway if they are close and stay together:
@@ -130,16 +125,13 @@ def _posts(
 
 
 def _intercept(
-    agents: Float[Array, "#M 2"],
-    posts: Float[Array, "M 2"],
-    velocities: Float[Array, "M 2"],
-    params: SpreadParams,
+    start: Float[Array, "#M 2"], posts: Float[Array, "M 2"], motion: Float[Array, "M 2"], params: SpreadParams
 ) -> Float[Array, "M 2"]:
     """Where agents at top speed meet their moving posts, no sooner than `_coast` looks ahead."""
     meeting = posts
     for _ in range(2):  # time from place, place from time, and once more
-        time = _length(meeting - agents) / params.physics.top_speed + 3 * params.physics.time_step
-        meeting, _ = reflect(posts + time[:, None] * velocities, velocities, params.arena_scale)
+        time = _length(meeting - start) / params.physics.top_speed + 3 * params.physics.time_step
+        meeting, _ = reflect(posts + time[:, None] * motion, motion, params.arena_scale)
     return meeting
 
 

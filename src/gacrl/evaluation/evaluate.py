@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams
-from gacrl.evaluation.metrics import count_step, episode_metrics, no_steps
+from gacrl.evaluation.metrics import Tally, count_step, episode_metrics, no_steps
 from gacrl.types import Channel, Memory, Policy, PRNGKey
 
 Stream = Literal["training", "monitor", "gate", "report"]
@@ -39,12 +39,10 @@ def evaluate(
     """
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes)
-    measures = jax.eval_shape(
-        lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1].info
-    )
+    measures = jax.eval_shape(lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1].info)
     tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
 
-    def one_step(loop: tuple[rollout.Carry, Array, object], key: PRNGKey):
+    def one_step(loop: tuple[rollout.Carry, Array, Tally], key: PRNGKey):
         carry, going, tally = loop
         carry, transition = rollout.step(env, policy, initial_memory, params, carry, key, channel)
         counted = jax.vmap(count_step)(tally, transition.info)

@@ -74,7 +74,7 @@ def episode_metrics(tally: Tally) -> dict[str, Float[Array, ""]]:
 class EpisodeSummary(NamedTuple):
     """The episodes that ended in a stretch of training: how many, sums for mean and spread, and the last."""
 
-    count: Int[Array, ""]
+    ended: Int[Array, ""]
     total: Metrics
     squares: Metrics
     last: Metrics
@@ -92,12 +92,8 @@ def count_episodes(
     """Take in the episodes of those environments that are done."""
 
     def add(total: Metrics, power: int) -> Metrics:
-        return {
-            name: total[name] + jnp.where(done, values**power, 0.0).sum() for name, values in episodes.items()
-        }
+        return {name: total[name] + jnp.where(done, values**power, 0.0).sum() for name, values in episodes.items()}
 
     any_done, newest = done.any(), jnp.argmax(done)
-    last = {
-        name: jnp.where(any_done, values[newest], summary.last[name]) for name, values in episodes.items()
-    }
-    return EpisodeSummary(summary.count + done.sum(), add(summary.total, 1), add(summary.squares, 2), last)
+    last = {name: jnp.where(any_done, values[newest], summary.last[name]) for name, values in episodes.items()}
+    return EpisodeSummary(summary.ended + done.sum(), add(summary.total, 1), add(summary.squares, 2), last)

@@ -32,12 +32,11 @@ def evaluate(
     params = env.default_params()
     act = jax.jit(jax.vmap(lambda memory, seen, key: policy(memory, seen, key, Channel())))
     measure = jax.jit(
-        jax.vmap(
-            lambda state, tally, raw: count_step(tally, {**env.measure(state, params), "reward_raw": raw})
-        )
+        jax.vmap(lambda state, tally, raw: count_step(tally, {**env.measure(state, params), "reward_raw": raw}))
     )
     tally = jax.vmap(lambda _: no_steps(env.measure(env.reset(key)[0], params)))(jnp.arange(num_episodes))
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_episodes, *leaf.shape)), initial_memory)
+    keep = jax.jit(lambda going, new, old: jax.tree.map(lambda n, o: jnp.where(going, n, o), new, old))
     going = np.ones(num_episodes, bool)
     for step_key in jax.random.split(key, env.max_cycles):
         state = _stacked(worlds)
@@ -47,7 +46,7 @@ def evaluate(
         actions = np.asarray(decision.action)
         raw = np.array([world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)])
         counted = measure(_stacked(worlds), tally, jnp.asarray(raw, jnp.float32))
-        tally = jax.tree.map(lambda new, old: jnp.where(jnp.asarray(going), new, old), counted, tally)
+        tally = keep(jnp.asarray(going), counted, tally)
         going &= np.array([not world.over for world in worlds])
     return {name: np.asarray(values) for name, values in jax.vmap(episode_metrics)(tally).items()}
 
@@ -77,27 +76,29 @@ class _World:
     def step(self, action: np.ndarray) -> float:
         """Act, and return the mean over agents of MPE2's reward at its default local ratio."""
         names = self._env.possible_agents
-        observations, rewards, terminated, truncated, _ = self._env.step(
-            dict(zip(names, action, strict=True))
-        )
+        observations, rewards, terminated, truncated, _ = self._env.step(dict(zip(names, action, strict=True)))
         self._take(observations)
         self.over = any(terminated.values()) or any(truncated.values())
         return float(np.mean(list(rewards.values())))
 
-    def state(self) -> SpreadState:
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions and velocities of the agents, positions of the landmarks."""
         agents, landmarks = self.world.agents, self.world.landmarks
-        return SpreadState(
-            positions=np.array([agent.state.p_pos for agent in agents], np.float32),
-            velocities=np.array([agent.state.p_vel for agent in agents], np.float32),
-            landmarks=np.array([landmark.state.p_pos for landmark in landmarks], np.float32),
-            landmark_velocities=np.zeros((len(landmarks), 2), np.float32),
-            clock=np.zeros((), np.int32),
+        return (
+            np.array([agent.state.p_pos for agent in agents], np.float32),
+            np.array([agent.state.p_vel for agent in agents], np.float32),
+            np.array([landmark.state.p_pos for landmark in landmarks], np.float32),
         )
 
 
 def _stacked(worlds: list[_World]) -> SpreadState:
-    states = [world.state() for world in worlds]
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *states)
+    """Where all the worlds stand, [K, …]; their landmarks rest."""
+    positions, velocities, landmarks = (
+        jnp.asarray(np.stack(parts)) for parts in zip(*(world.arrays() for world in worlds), strict=True)
+    )
+    return SpreadState(
+        positions, velocities, landmarks, jnp.zeros_like(landmarks), jnp.zeros(len(worlds), jnp.int32)
+    )
 
 
 def _require_possible(env: Spread) -> None:

@@ -46,7 +46,7 @@ class Row:
 @cache
 def printed() -> dict[str, Any]:
     """The paper's own numbers."""
-    return json.loads(resources.files(__package__).joinpath("paper.json").read_text(encoding="utf-8"))
+    return json.loads(resources.files("gacrl.experiments").joinpath("paper.json").read_text(encoding="utf-8"))
 
 
 def table_2(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
@@ -60,9 +60,7 @@ def table_2(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
         members = logged.get(int(episode), [])
         if members:
             rows.append(Row(int(episode), "paper", _paper_columns("table_2", numbers)))
-            rows += [
-                Row(int(episode), f"ours, seed {m['seed']}", m["train"]["last_episode"]) for m in members
-            ]
+            rows += [Row(int(episode), f"ours, seed {m['seed']}", m["train"]["last_episode"]) for m in members]
             rows += _references(config, int(episode), members[0]["task"])
     return rows
 
@@ -113,9 +111,7 @@ def _references(config: RunConfig, episode: int, task: Mapping[str, float]) -> l
     return rows
 
 
-def _play_scripted(
-    name: str, config: RunConfig, local_ratio: float, threshold: float
-) -> dict[str, np.ndarray]:
+def _play_scripted(name: str, config: RunConfig, local_ratio: float, threshold: float) -> dict[str, np.ndarray]:
     play, params = _compiled(name, config.env)
     params = params._replace(local_ratio=jnp.asarray(local_ratio), coverage_threshold=jnp.asarray(threshold))
     return jax.device_get(play(params, stream_key("report")))

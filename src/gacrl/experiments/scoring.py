@@ -55,7 +55,7 @@ def score_run(
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in references[run].items()})}
     else:
         opened = open_run(run, changes.apply, warn)
-        env = opened.trainer.env
+        env = opened.env
         references = _references(env, episodes, backend)
         final = {
             kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
@@ -99,9 +99,7 @@ def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: str) -> 
         metrics = jax.device_get(opened.trainer.evaluate(opened.learners, explore, "report", episodes))
         return {name: values.mean(1)[:members] for name, values in metrics.items()}
     played = [
-        mpe2.evaluate(
-            opened.env, opened.policy(k, explore), opened.trainer.memory, stream_key("report"), episodes
-        )
+        mpe2.evaluate(opened.env, opened.policy(k, explore), opened.trainer.memory, stream_key("report"), episodes)
         for k in range(members)
     ]
     return {name: np.array([metrics[name].mean() for metrics in played]) for name in played[0]}

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -92,7 +93,7 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "") -> Tree:
         loaded: list[Any] = []
         for key_path, leaf in leaves:
             name = prefix + jax.tree_util.keystr(key_path)
-            is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+            is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
             found = file.get_tensor(name) if name in saved else None
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
@@ -101,7 +102,7 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "") -> Tree:
                     f"{checkpoint.folder} holds another architecture: {name} is {has} there and "
                     f"{wanted.dtype}{list(wanted.shape)} here; use the config.json that it was trained with"
                 )
-            array = jax.numpy.asarray(found)
+            array = jnp.asarray(found)
             loaded.append(jax.random.wrap_key_data(array) if is_key else array)
     return jax.tree_util.tree_unflatten(structure, loaded)
 
@@ -124,13 +125,15 @@ def _folders(folder: Path) -> list[Path]:
 
 def _to_arrays(state: PyTree) -> dict[str, np.ndarray]:
     def plain(leaf: jax.Array) -> np.ndarray:
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        if _is_key(leaf):
             leaf = jax.random.key_data(leaf)
         return np.ascontiguousarray(leaf)
 
-    return {
-        jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)
-    }
+    return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _write_synced(path: Path, content: bytes) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
-
 _CACHE_BYTES = 512 * 2**20
 """Bound of the compilation cache; the oldest programs go first."""
 
@@ -40,7 +39,7 @@ def prepare_jax(num_seeds: int = 1) -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def devices_for(num_seeds: int) -> list[jax.Device]:
+def devices_for(num_seeds: int) -> list[Any]:
     """As many devices as can be kept busy by this many seeds."""
     return jax.local_devices()[: min(num_seeds, jax.local_device_count())]
 

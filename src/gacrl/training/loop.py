@@ -116,7 +116,7 @@ def _rows(
 
     def row(member: int, seed: int) -> dict[str, Any]:
         seen = jax.tree.map(lambda leaf: leaf[member], report.episodes)
-        count = max(int(seen.count), 1)
+        count = max(int(seen.ended), 1)
         mean = {name: float(total) / count for name, total in seen.total.items()}
         spread = {
             name: float(np.sqrt(max(float(squares) / count - mean[name] ** 2, 0.0)))
@@ -127,7 +127,7 @@ def _rows(
             "env_steps": env_steps,
             "episodes_done": int(finished[member]),
             "train": {
-                "episodes": int(seen.count),
+                "episodes": int(seen.ended),
                 "mean": mean,
                 "sd": spread,
                 "last_episode": {name: float(value) for name, value in seen.last.items()},

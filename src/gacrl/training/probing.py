@@ -46,10 +46,7 @@ def probe_algorithm(
     learned = jax.device_get(jax.jit(jax.vmap(learn))(jnp.arange(len(PROBES))))
     return ProbeResult(
         {name: float(learned["return"][k]) for k, name in enumerate(PROBES)},
-        {
-            name: (float(learned["value"][k][0]), float(learned["value"][k][1]))
-            for k, name in enumerate(PROBES)
-        },
+        {name: (float(learned["value"][k][0]), float(learned["value"][k][1])) for k, name in enumerate(PROBES)},
     )
 
 

@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -69,15 +69,13 @@ class RunFolder:
             raise UserError(str(error)) from error
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> Generator[None]:
         """Hold the folder for one writing process; the system frees the lock of one that died."""
         lock = FileLock(self.path / ".lock")
         try:
             lock.acquire(timeout=0)
         except Timeout as error:
-            raise UserError(
-                f"{self.path} is in use by another gacrl process: wait for it, or stop it"
-            ) from error
+            raise UserError(f"{self.path} is in use by another gacrl process: wait for it, or stop it") from error
         try:
             yield
         finally:

@@ -16,6 +16,7 @@ from gacrl import envs, render
 from gacrl.algorithms import algorithm as algorithms
 from gacrl.config import RunConfig
 from gacrl.envs import scripted
+from gacrl.envs.spread import Spread
 from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
@@ -68,7 +69,6 @@ class Watcher:
 def build(config: RunConfig) -> Trainer:
     """The compiled functions that train this configuration."""
     env = envs.make(config.env)
-    horizon = config.evaluation.horizon
     return Trainer(
         algorithm=algorithms.make(config.algorithm, env),
         env=env,
@@ -76,8 +76,14 @@ def build(config: RunConfig) -> Trainer:
         num_envs=config.training.num_envs,
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,
-        evaluation_env=env if horizon is None else replace(env, max_cycles=horizon),
+        evaluation_env=evaluation_env(config),
     )
+
+
+def evaluation_env(config: RunConfig) -> Spread:
+    """The task as it is evaluated: with the evaluation's own horizon, where it has one."""
+    env, horizon = envs.make(config.env), config.evaluation.horizon
+    return env if horizon is None else replace(env, max_cycles=horizon)
 
 
 def plan(trainer: Trainer, config: RunConfig) -> Plan:
@@ -162,7 +168,7 @@ def _finish(
 ) -> dict[str, Any]:
     """The closing evaluation, some episodes to look at, and the summary."""
     num_episodes = config.evaluation.final_episodes
-    env = trainer.evaluation_env
+    env = evaluation_env(config)
     final = {
         kind: jax.device_get(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes))
         for kind in ("greedy", "sampled")
@@ -174,9 +180,7 @@ def _finish(
         "seeds": list(config.seeds),
         "env_steps": env_steps,
         "final": {
-            kind: normalised(
-                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references
-            )
+            kind: normalised(over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references)
             for kind, values in final.items()
         },
         "references": references,
@@ -199,7 +203,7 @@ def _finish(
     return summary
 
 
-def evaluate_scripted(env: envs.Spread, num_episodes: int) -> dict[str, dict[str, float]]:
+def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, float]]:
     """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
 
     def mean_metrics(name: str) -> dict[str, float]:

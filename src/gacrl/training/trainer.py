@@ -136,7 +136,7 @@ class Trainer:
         env_steps = (state.updates + 1) * (self.num_envs * self.num_steps)
         curriculum, env_params = self.curriculum.advance(state.curriculum, env_steps, experience)
         tally, episodes = self._count(state.tally, experience)
-        finished = state.episodes + episodes.count
+        finished = state.episodes + episodes.ended
         state = TrainState(learner, carry, env_params, curriculum, tally, finished, key, state.updates + 1)
         return state, episodes, metrics
 
@@ -169,12 +169,10 @@ class Trainer:
             used = state.env_params
             state, episodes, metrics = self._update(state)
             seen = EpisodeSummary(
-                seen.count + episodes.count,
+                seen.ended + episodes.ended,
                 jax.tree.map(jnp.add, seen.total, episodes.total),
                 jax.tree.map(jnp.add, seen.squares, episodes.squares),
-                jax.tree.map(
-                    lambda new, old: jnp.where(episodes.count > 0, new, old), episodes.last, seen.last
-                ),
+                jax.tree.map(lambda new, old: jnp.where(episodes.ended > 0, new, old), episodes.last, seen.last),
             )
             return state, seen, jax.tree.map(jnp.add, totals, metrics), used
 

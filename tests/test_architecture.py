@@ -1,0 +1,153 @@
+"""The shape of the house: imports run one way, the command line starts without JAX, public names are there."""
+
+import ast
+import importlib
+import inspect
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import gacrl
+
+PACKAGE = Path(gacrl.__file__).parent
+
+LAYERS = (
+    ("errors", "types", "config"),
+    ("arguments", "envs", "networks"),
+    ("algorithms",),
+    ("rollout",),
+    ("evaluation", "render"),
+    ("training",),
+    ("experiments", "play", "api"),
+    ("cli", "progress", "doctor"),
+)
+"""A room may import from its own layer and those above it in this list."""
+LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
+
+
+def rooms_imported(source: str) -> Iterator[tuple[int, str]]:
+    """Line and room of every import from this package, also inside functions; not those for type checkers."""
+    for node in without_type_checking(ast.parse(source)):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                raise ValueError(f"line {node.lineno}: a relative import")
+            names = [node.module or ""]
+            if node.module == "gacrl":
+                names = [f"gacrl.{alias.name}" for alias in node.names]
+        for name in names:
+            package, _, rest = name.partition(".")
+            if package == "gacrl":
+                yield node.lineno, rest.partition(".")[0]
+
+
+def without_type_checking(node: ast.AST) -> Iterator[ast.AST]:
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            child = ast.Module(child.orelse, [])
+        yield from without_type_checking(child)
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def backward_imports(room: str, source: str) -> list[str]:
+    """A room that is in no layer, and one that the package does not have, raise KeyError."""
+    return [
+        f"line {line}: {room} imports {imported}"
+        for line, imported in rooms_imported(source)
+        if LEVEL[imported] > LEVEL[room]
+    ]
+
+
+MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_run_one_way(path: Path):
+    source = path.read_text(encoding="utf-8")
+    assert backward_imports(room_of(path), source) == []
+    assert ast.get_docstring(ast.parse(source)), "a module says what it holds"
+
+
+def test_every_layer_stands_on_files():
+    assert {room_of(path) for path in MODULES} == set(LEVEL)
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from gacrl.envs import spread\nimport gacrl.config", []),
+        ("import gacrl.training.loop", ["line 1: rollout imports training"]),
+        ("def f():\n    from gacrl import play as p", ["line 2: rollout imports play"]),
+        ("if TYPE_CHECKING:\n    from gacrl import cli\nelse:\n    import gacrl.api", ["line 4: rollout imports api"]),
+        ("import jax\nfrom gacrlother import cli", []),
+    ],
+)
+def test_a_backward_import_is_seen(source: str, found: list[str]):
+    assert backward_imports("rollout", source) == found
+
+
+def test_an_unknown_room_is_seen():
+    with pytest.raises(KeyError, match="cellar"):
+        backward_imports("cli", "from gacrl.cellar import wine")
+
+
+def test_the_command_line_starts_without_jax():
+    """`import gacrl` loads no numpy either; help, the list of presets and mistakes need none of it."""
+    code = """
+import sys
+def loaded():
+    return sorted({name.partition(".")[0] for name in sys.modules} & {"jax", "numpy", "equinox", "scipy"})
+import gacrl
+print("gacrl", loaded(), dir(gacrl) and "")
+import gacrl.config, gacrl.errors, gacrl.cli, gacrl.arguments
+print("cli", "jax" in loaded())
+for words in (["--help"], ["presets"], ["config"], ["train", "--nonsense"], ["trian"], ["evaluate", "--help"]):
+    try:
+        gacrl.cli.main(words)
+    except SystemExit:
+        pass
+print("commands", "jax" in loaded())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    lines = done.stdout.splitlines()
+    assert lines[0] == "gacrl [] "
+    assert "cli False" in lines
+    assert lines[-1] == "commands False"
+
+
+def test_public_names_exist_and_say_what_they_are():
+    assert sorted(gacrl.__all__) == gacrl.__all__
+    for name in gacrl.__all__:
+        thing = getattr(gacrl, name)
+        assert inspect.getdoc(thing), name
+        assert thing.__doc__, f"{name} has no docstring of its own"
+        assert name in dir(gacrl)
+        assert getattr(importlib.import_module(thing.__module__), name) is thing
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.name: node.module
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert sorted(seen) == gacrl.__all__
+    for name, home in seen.items():
+        assert getattr(importlib.import_module(str(home)), name) is getattr(gacrl, name)
+
+
+def test_an_unknown_public_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        _ = gacrl.trian
