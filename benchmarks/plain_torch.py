@@ -4,7 +4,7 @@ One environment, one summed loss, one Adam, one update per environment step. It 
 the library's speed and shares no code with it. Numbers in brackets are the paper's equations.
 Needs `torch` and `mpe2`. Axes: B batch, N agents, 18 observation numbers, 5 actions.
 
-    python benchmarks/plain_torch.py --steps 1500 --warmup 300 [--core K] [--seed S] [--json]
+    python benchmarks/plain_torch.py --steps 1500 --warmup 300 [--core K] [--seed S] [--fused] [--json]
 """
 
 # ruff: noqa: E402
@@ -128,12 +128,12 @@ def update(model, optimiser, batch, log_prob, reward, tau):
     optimiser.step()
 
 
-def train(steps, seed):
+def train(steps, seed, fused=False):
     """Yields after each environment step: seconds in environment, seconds in update, reward."""
     torch.manual_seed(seed)
     env = simple_spread_v3.parallel_env(N=N, max_cycles=EPISODE_STEPS)
     model, replay = Agents(), Replay(np.random.default_rng(seed))
-    optimiser = torch.optim.Adam(model.parameters(), fused=True)
+    optimiser = torch.optim.Adam(model.parameters(), fused=fused or None)
     for step in range(steps):
         episode, t = divmod(step, EPISODE_STEPS)
         clock = time.perf_counter()
@@ -170,6 +170,7 @@ def main():
     parser.add_argument("--warmup", type=int, default=300, help="environment steps before them")
     parser.add_argument("--core", type=int, help="pin the process to this core")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fused", action="store_true", help="PyTorch's fused Adam, quicker than the default")
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     args = parser.parse_args()
     if args.steps < SEGMENTS or args.warmup < 1:
@@ -179,7 +180,7 @@ def main():
     torch.set_num_threads(1)
 
     length = args.steps // SEGMENTS
-    run = train(args.warmup + length * SEGMENTS, args.seed)
+    run = train(args.warmup + length * SEGMENTS, args.seed, args.fused)
     # columns: when the step ended, seconds in environment, seconds in update, reward
     rows = np.array([(time.perf_counter(), *row) for row in run])
     ends = rows[args.warmup - 1 :: length, 0][: SEGMENTS + 1]

@@ -172,7 +172,7 @@ def _sentence(box: str, command: str) -> str:
     lines = [line.strip("│╭╮╰╯─ ") for line in box.splitlines()]
     lines = lines[1:] if lines else lines  # the box's title
     problem = " ".join(lines[: lines.index("")]) if "" in lines else " ".join(lines)
-    problem = re.sub(r"^Error parsing \S+: ", "", problem).rstrip(". ")
+    problem = re.sub(r"^Error parsing (?!--)\S+: ", "", problem).rstrip(". ")
     problem = problem[:1].lower() + problem[1:]
     wrong = re.findall(r"--[\w.-]+", problem)
     options = [line.split()[0] for line in lines if line.startswith("--")]

@@ -143,6 +143,8 @@ def _base_settings(words: list[str]) -> RunConfig:
         flag, _, value = word.partition("=")
         if flag in ("--preset", "--config"):
             named[flag] = value or following
+            if not named[flag] or named[flag].startswith("--"):
+                raise UserError(f"{flag} needs a value: see `gacrl train --help`")
     if "--config" not in named:
         return configuration.preset(named.get("--preset", configuration.DEFAULT_PRESET))
     base = configuration.preset(named["--preset"]) if "--preset" in named else None

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
-from gacrl.errors import UserError
+from gacrl.errors import UserError, reason
 
 
 class ConfigError(UserError, ValueError):
@@ -31,8 +31,12 @@ def _between(section: str, settings: object, low: int | float, high: int | float
         if value is not None:
             _require(
                 isinstance(value, int | float) and low <= value <= high,
-                f"{section}.{name} must be between {low:g} and {high:g}, not {value}",
+                f"{section}.{name} must be between {_shown(low)} and {_shown(high)}, not {value}",
             )
+
+
+def _shown(bound: int | float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
 @dataclass(frozen=True)
@@ -283,7 +287,7 @@ def unknown(kind: str, name: str, known: Mapping[str, Any] | set[str] | list[str
     """The sentence for a name that is not among the known ones, with the nearest of them."""
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
     mend = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
-    return f"unknown {kind} '{name}': {mend}" + (f" ({hint})" if hint else "")
+    return f"unknown {kind} {name!r}: {mend}" + (f" ({hint})" if hint else "")
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
@@ -297,8 +301,8 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
 
     Raises ConfigError for an unknown key (with the nearest known one) or a value of the wrong type.
     """
-    if base is None:
-        base = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
+    named = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
+    base = named if base is None else base
     data = dict(data)
     if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
         settings = dict(data["algorithm"])
@@ -319,8 +323,9 @@ def load(path: Path, base: RunConfig | None = None) -> RunConfig:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
-    except ValueError as error:
+        mend = "`gacrl config` prints one to start from"
+        raise ConfigError(f"cannot read the configuration {path}: {reason(error)}; {mend}") from error
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path} must hold a JSON object of settings")
@@ -336,8 +341,10 @@ def dumps(config: RunConfig) -> str:
 
 
 def fingerprint(config: RunConfig) -> str:
-    """A hash of every setting: what a checkpoint belongs to."""
-    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
+    """A hash of every setting but the run's length, which may be extended: what a checkpoint belongs to."""
+    data = to_dict(config)
+    del data["training"]["env_steps"]
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _text(value: Any, where: str) -> str:
@@ -382,7 +389,9 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
     if origin is not None and type(None) in arguments:  # X | None
         return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return float(str(value))  # infinity where it is too large
+    if origin is tuple:
+        raise ConfigError(f"{where} must be a list of whole numbers, not {value!r}")
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
     matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
     _require(matches, f"{where} must be {wanted}, not {value!r}")

@@ -1,5 +1,6 @@
 """What the terminal shows: a header, a live line (or a line per evaluation), and tables at the end."""
 
+import sys
 import time
 from types import TracebackType
 from typing import Any
@@ -58,12 +59,12 @@ class TerminalWatcher:
             compiling=lambda: self._say("compiling the training program"),
             progress=self._progress,
             finishing=lambda: self._say("closing evaluation, episodes and GIF"),
-            warn=lambda sentence: self._console.print(f"gacrl: {sentence}"),
+            warn=lambda sentence: print(f"gacrl: {sentence}", file=sys.stderr),
             stop=lambda: self._stop,
         )
 
     def _planned(self, folder: RunFolder, config: RunConfig, plan: Plan) -> None:
-        env, say = config.env, self._console.print
+        env, say = config.env, self._print
         seeds = ", ".join(str(seed) for seed in config.seeds)
         say(f"run        {folder.path}")
         say(f"task       {env.name}: {env.num_agents} agents, {env.landmarks} landmarks, {env.max_cycles} steps")
@@ -83,7 +84,10 @@ class TerminalWatcher:
         if self._alive:
             self._line.text = what
         else:
-            self._console.print(what)
+            self._print(what)
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True)  # a path is to be copied: no line breaks in it
 
     def _progress(self, progress: Progress) -> None:
         line = describe(progress, progress.rows[0]["episodes_done"])
@@ -91,12 +95,12 @@ class TerminalWatcher:
             self._line.text = line
             self._line.fraction = progress.env_steps / progress.total_env_steps
         else:
-            self._console.print(line)
+            self._print(line)
 
     def report(self, run: Run) -> None:
         """The end: what was reached, the paper's tables where they apply, and where everything lies."""
         self._live.stop()
-        say = self._console.print
+        say = self._print
         if run.summary is None:
             say(f"stopped at environment step {run.env_steps:,}; go on with: gacrl resume {run.folder}")
             return
@@ -143,7 +147,7 @@ class TerminalWatcher:
 
 def _console() -> Console:
     """Colours and the terminal's width on a terminal; elsewhere lines that a log can hold."""
-    console = Console(highlight=False, soft_wrap=False)
+    console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
         console.width = 130
     return console
@@ -186,14 +190,16 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
     """A table of the main metrics: the policy, and random, noop and oracle on the same starts."""
     console = _console() if console is None else console
     title = f"{scores['run']}: {scores['episodes']} episodes of {scores['horizon']} steps"
+    if any(metrics["return_agent_mean"]["interval"] for metrics in scores["final"].values()):
+        title += "; mean over seeds ± half the 95 % interval"
     table = Table("", *_SHOWN.values(), title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for kind, metrics in scores["final"].items():
         cells: list[str] = []
         for name in _SHOWN:
             entry = metrics.get(name)
             interval = entry and entry["interval"]
-            bounds = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
-            cells.append(_cell(entry and entry["mean"], None, 3) + bounds)
+            half_width = (interval[1] - interval[0]) / 2 if interval else None
+            cells.append(_cell(entry and entry["mean"], half_width, 3))
         table.add_row(kind, *cells)
     table.add_section()
     for who, metrics in scores["references"].items():

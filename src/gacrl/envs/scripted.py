@@ -99,8 +99,8 @@ def _oracle(env: Spread) -> Scripted:
         pushes = _pushes((target - coasting) / reach, env.continuous_actions)
         outcomes = coasting[:, None] + reach * pushes
         distance = _length(outcomes - target[:, None])
-        # The others are expected where each would go if it were alone.
-        expected = _row_choice(outcomes, distance.argmin(axis=1))
+        # The others are expected halfway between coasting on and what each would do if it were alone.
+        expected = (coasting + _row_choice(outcomes, distance.argmin(axis=1))) / 2
         choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
         return Decision(_as_action(_row_choice(pushes, choice), env.continuous_actions)), landmark
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams
-from gacrl.evaluation.metrics import Tally, count_step, episode_metrics, no_steps
+from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, metric_names, no_steps
 from gacrl.types import Channel, Memory, Policy, PRNGKey
 
 Stream = Literal["training", "monitor", "gate", "report"]
@@ -39,16 +39,14 @@ def evaluate(
     """
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes)
-    measures = jax.eval_shape(lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1].info)
+    first_step = jax.eval_shape(lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1])
+    measures = sorted(first_step.info)
     tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
 
     def one_step(loop: tuple[rollout.Carry, Array, Tally], key: PRNGKey):
         carry, going, tally = loop
         carry, transition = rollout.step(env, policy, initial_memory, params, carry, key, channel)
-        counted = jax.vmap(count_step)(tally, transition.info)
-        tally = jax.tree.map(
-            lambda new, old: jnp.where(going, new, old), counted, tally
-        )  # an episode that has ended stays as it ended
+        tally = jax.vmap(count_step_if)(going, tally, transition.info)
         return (carry, going & ~carry.first, tally), None
 
     (_, _, tally), _ = jax.lax.scan(
@@ -56,4 +54,5 @@ def evaluate(
         (carry, jnp.ones(num_episodes, bool), tally),
         jax.random.split(act_key, env.max_cycles),
     )
-    return jax.vmap(episode_metrics)(tally)
+    metrics = jax.vmap(lambda tally: episode_metrics(tally, measures))(tally)
+    return dict(zip(metric_names(measures), metrics.T, strict=True))

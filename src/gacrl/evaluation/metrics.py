@@ -1,10 +1,11 @@
 """From the measurements of steps to the metrics of episodes, under the names that users rely on."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.types import Metrics
@@ -41,59 +42,74 @@ EPISODE_METRICS: dict[str, EpisodeMetric] = {
 }
 
 
-class Tally(NamedTuple):
-    """An episode so far: sums of its measurements, the latest ones, and the steps taken."""
+def metric_names(measures: Sequence[str]) -> tuple[str, ...]:
+    """The episode metrics of a task that measures these things, in the order of their vectors."""
+    return tuple(name for name, metric in EPISODE_METRICS.items() if metric.measure in measures)
 
-    total: Metrics
-    last: Metrics
+
+class Tally(NamedTuple):
+    """An episode so far. Measurements stand in vectors, ordered by name: a training step that is a fraction of a
+    millisecond long has no time for a program of a few scalars each."""
+
+    total: Float[Array, " M"]
+    last: Float[Array, " M"]
     steps: Int[Array, ""]
 
 
-def no_steps(measures: Iterable[str]) -> Tally:
+def no_steps(measures: Sequence[str]) -> Tally:
     """The tally before an episode's first step."""
-    zeros = {name: jnp.zeros(()) for name in measures}
+    zeros = jnp.zeros(len(measures))
     return Tally(zeros, zeros, jnp.zeros((), jnp.int32))
 
 
 def count_step(tally: Tally, info: Metrics) -> Tally:
     """Take in the measurements of one more step."""
-    return Tally(jax.tree.map(jnp.add, tally.total, info), info, tally.steps + 1)
+    now = jnp.stack([info[name] for name in sorted(info)])
+    return Tally(tally.total + now, now, tally.steps + 1)
 
 
-def episode_metrics(tally: Tally) -> dict[str, Float[Array, ""]]:
-    """The metrics of a finished episode, of those that its task measures."""
-    steps = jnp.maximum(tally.steps, 1)
+def count_step_if(going: Bool[Array, ""], tally: Tally, info: Metrics) -> Tally:
+    """The same for an episode that is still going on; one that has ended stays as it ended."""
+    counted = count_step(tally, info)
+    return jax.tree.map(lambda new, old: jnp.where(going, new, old), counted, tally)
 
-    def reduce(metric: EpisodeMetric) -> Float[Array, ""]:
-        total = tally.total[metric.measure]
-        return {"mean": total / steps, "sum": total, "last": tally.last[metric.measure]}[metric.over_steps]
 
-    return {name: reduce(metric) for name, metric in EPISODE_METRICS.items() if metric.measure in tally.total}
+def episode_metrics(tally: Tally, measures: Sequence[str]) -> Float[Array, " K"]:
+    """The metrics of a finished episode, in the order of `metric_names(measures)`.
+
+    measures: the names of the tally's measurements, sorted.
+    """
+    means = tally.total / jnp.maximum(tally.steps, 1)
+    candidates = jnp.concatenate([means, tally.total, tally.last])
+    offset = {"mean": 0, "sum": len(measures), "last": 2 * len(measures)}
+    chosen = [EPISODE_METRICS[name] for name in metric_names(measures)]
+    places = [offset[metric.over_steps] + measures.index(metric.measure) for metric in chosen]
+    return candidates[np.array(places)]
 
 
 class EpisodeSummary(NamedTuple):
     """The episodes that ended in a stretch of training: how many, sums for mean and spread, and the last."""
 
     ended: Int[Array, ""]
-    total: Metrics
-    squares: Metrics
-    last: Metrics
+    total: Float[Array, " K"]
+    squares: Float[Array, " K"]
+    last: Float[Array, " K"]
 
 
-def no_episodes(measures: Iterable[str]) -> EpisodeSummary:
+def no_episodes(measures: Sequence[str]) -> EpisodeSummary:
     """Before any episode has ended."""
-    zeros = episode_metrics(no_steps(measures))
+    zeros = jnp.zeros(len(metric_names(measures)))
     return EpisodeSummary(jnp.zeros((), jnp.int32), zeros, zeros, zeros)
 
 
 def count_episodes(
-    summary: EpisodeSummary, episodes: dict[str, Float[Array, " E"]], done: Bool[Array, " E"]
+    summary: EpisodeSummary, episodes: Float[Array, "E K"], done: Bool[Array, " E"]
 ) -> EpisodeSummary:
     """Take in the episodes of those environments that are done."""
-
-    def add(total: Metrics, power: int) -> Metrics:
-        return {name: total[name] + jnp.where(done, values**power, 0.0).sum() for name, values in episodes.items()}
-
-    any_done, newest = done.any(), jnp.argmax(done)
-    last = {name: jnp.where(any_done, values[newest], summary.last[name]) for name, values in episodes.items()}
-    return EpisodeSummary(summary.ended + done.sum(), add(summary.total, 1), add(summary.squares, 2), last)
+    finished = jnp.where(done[:, None], episodes, 0.0)
+    return EpisodeSummary(
+        ended=summary.ended + done.sum(),
+        total=summary.total + finished.sum(0),
+        squares=summary.squares + jnp.square(finished).sum(0),
+        last=jnp.where(done.any(), episodes[jnp.argmax(done)], summary.last),
+    )

@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from gacrl.envs.spread import REPORTED_LOCAL_RATIO, Spread, SpreadState
 from gacrl.errors import UserError
-from gacrl.evaluation.metrics import count_step, episode_metrics, no_steps
+from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, metric_names, no_steps
 from gacrl.types import Channel, Memory, Policy, PRNGKey
 
 _FIRST_SEED = 700_000
@@ -31,12 +32,15 @@ def evaluate(
     worlds = [_World(env, _FIRST_SEED + episode) for episode in range(num_episodes)]
     params = env.default_params()
     act = jax.jit(jax.vmap(lambda memory, seen, key: policy(memory, seen, key, Channel())))
-    measure = jax.jit(
-        jax.vmap(lambda state, tally, raw: count_step(tally, {**env.measure(state, params), "reward_raw": raw}))
-    )
-    tally = jax.vmap(lambda _: no_steps(env.measure(env.reset(key)[0], params)))(jnp.arange(num_episodes))
+    measures = sorted(jax.eval_shape(lambda: env.measure(env.reset(key)[0], params)))
+
+    @jax.jit
+    @jax.vmap
+    def count(going: Array, tally: Tally, state: SpreadState, reward: Array) -> Tally:
+        return count_step_if(going, tally, {**env.measure(state, params), "reward_raw": reward})
+
+    tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_episodes, *leaf.shape)), initial_memory)
-    keep = jax.jit(lambda going, new, old: jax.tree.map(lambda n, o: jnp.where(going, n, o), new, old))
     going = np.ones(num_episodes, bool)
     for step_key in jax.random.split(key, env.max_cycles):
         state = _stacked(worlds)
@@ -44,11 +48,11 @@ def evaluate(
         seen = seen._replace(features=jnp.stack([world.features for world in worlds]))
         decision, memory = act(memory, seen, jax.random.split(step_key, num_episodes))
         actions = np.asarray(decision.action)
-        raw = np.array([world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)])
-        counted = measure(_stacked(worlds), tally, jnp.asarray(raw, jnp.float32))
-        tally = keep(jnp.asarray(going), counted, tally)
+        rewards = [world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)]
+        tally = count(going, tally, _stacked(worlds), np.array(rewards, np.float32))
         going &= np.array([not world.over for world in worlds])
-    return {name: np.asarray(values) for name, values in jax.vmap(episode_metrics)(tally).items()}
+    metrics = jax.vmap(lambda tally: episode_metrics(tally, measures))(tally)
+    return dict(zip(metric_names(measures), np.asarray(metrics).T, strict=True))
 
 
 class _World:

@@ -99,7 +99,9 @@ def train(
         wall = before.wall + time.perf_counter() - started
         clock = Clock(wall, training, compiling, timed)
         finished = jax.device_get(state.episodes)
-        rows = _rows(config, jax.device_get(report), evaluations, done * per_update, finished, clock)
+        rows = _rows(
+            config, jax.device_get(report), trainer.metric_names, evaluations, done * per_update, finished, clock
+        )
         _require_finite(rows)
         yield Progress(done * per_update, total * per_update, clock, rows, state)
 
@@ -107,6 +109,7 @@ def train(
 def _rows(
     config: RunConfig,
     report: ChunkReport,
+    names: tuple[str, ...],
     evaluations: dict[str, Any],
     env_steps: int,
     finished: np.ndarray,
@@ -116,12 +119,11 @@ def _rows(
 
     def row(member: int, seed: int) -> dict[str, Any]:
         seen = jax.tree.map(lambda leaf: leaf[member], report.episodes)
-        count = max(int(seen.ended), 1)
-        mean = {name: float(total) / count for name, total in seen.total.items()}
-        spread = {
-            name: float(np.sqrt(max(float(squares) / count - mean[name] ** 2, 0.0)))
-            for name, squares in seen.squares.items()
-        }
+        mean = seen.total / max(seen.ended, 1)
+        spread = np.sqrt(np.maximum(seen.squares / max(seen.ended, 1) - mean**2, 0.0))
+        mean, spread, last = (
+            dict(zip(names, map(float, vector), strict=True)) for vector in (mean, spread, seen.last)
+        )
         return {
             "seed": seed,
             "env_steps": env_steps,
@@ -130,7 +132,7 @@ def _rows(
                 "episodes": int(seen.ended),
                 "mean": mean,
                 "sd": spread,
-                "last_episode": {name: float(value) for name, value in seen.last.items()},
+                "last_episode": last,
             },
             "update": {name: float(values[member]) for name, values in report.metrics.items()},
             "task": _difficulty(report.env_params, member),

@@ -33,12 +33,13 @@ class RunFolder:
 
         Raises UserError where the path exists already, or cannot be written.
         """
+        configuration.from_dict(configuration.to_dict(config))  # refuses now what could not be loaded again
         try:
             if path is None:
                 path = _next_free(Path("runs"), config.preset)
             elif path.exists() and (not path.is_dir() or any(path.iterdir())):
-                mend = f"continue it with `gacrl resume {path}`" if _is_run(path) else "it holds other things"
-                raise UserError(f"{path} exists and is not overwritten: choose another --out, or {mend}")
+                mend = f", or continue it with `gacrl resume {path}`" if _is_run(path) else ""
+                raise UserError(f"{path} exists and is not overwritten: choose another --out{mend}")
             else:
                 path.mkdir(parents=True, exist_ok=True)
             folder = cls(path)
@@ -48,7 +49,7 @@ class RunFolder:
             folder.metrics_file.touch()
         except OSError as error:
             raise UserError(
-                f"cannot write the run folder {path}: {reason(error)}; choose another with --out"
+                f"cannot write the run folder {path or 'under runs'}: {reason(error)}; choose another with --out"
             ) from error
         return folder
 

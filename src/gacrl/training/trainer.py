@@ -20,6 +20,7 @@ from gacrl.evaluation.metrics import (
     count_episodes,
     count_step,
     episode_metrics,
+    metric_names,
     no_episodes,
     no_steps,
 )
@@ -78,6 +79,9 @@ class Trainer:
         self.num_seeds = num_seeds
         self.evaluation_env = env if evaluation_env is None else evaluation_env
         self.memory = algorithm.initial_memory(env.num_agents)
+        self.measures = _measures(env)
+        self.metric_names = metric_names(self.measures)
+        """What the vectors of a chunk's episode summary hold."""
         self.chunk = jax.jit(map_seeds(self.chunk_of_one, num_seeds), donate_argnums=0)
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
@@ -97,7 +101,7 @@ class Trainer:
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
         learner_key, start_key, key = jax.random.split(key, 3)
         carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs)
-        tally = jax.vmap(lambda _: no_steps(self._measures(params)))(jnp.arange(self.num_envs))
+        tally = jax.vmap(lambda _: no_steps(self.measures))(jnp.arange(self.num_envs))
         return TrainState(
             learner=self.algorithm.init(learner_key, hyper),
             carry=carry,
@@ -108,17 +112,6 @@ class Trainer:
             key=key,
             updates=jnp.zeros((), jnp.int32),
         )
-
-    def _measures(self, params: EnvParams) -> list[str]:
-        """The names of what a step of this task measures."""
-
-        def info() -> Metrics:
-            state, _ = self.env.reset(jax.random.key(0), params)
-            shape = (self.env.num_agents, self.env.num_actions)
-            action = jnp.zeros(shape) if self.env.continuous_actions else jnp.zeros(shape[0], jnp.int32)
-            return self.env.step(state, action, jax.random.key(0), params)[1].info
-
-        return list(jax.eval_shape(info))
 
     def _update(self, state: TrainState) -> tuple[TrainState, EpisodeSummary, Metrics]:
         """Gather experience, learn from it, move the task on: one turn of the loop."""
@@ -142,21 +135,21 @@ class Trainer:
 
     def _count(self, tally: Tally, experience: rollout.Rollout) -> tuple[Tally, EpisodeSummary]:
         """Follow the episodes of a rollout, and sum up those that ended in it."""
-        fresh = no_steps(tally.total)
+        fresh = no_steps(self.measures)
 
         def one_step(loop: tuple[Tally, EpisodeSummary], step: Any):
             tally, summary = loop
             info, done = step
             tally = jax.vmap(count_step)(tally, info)
-            summary = count_episodes(summary, jax.vmap(episode_metrics)(tally), done)
-            tally = jax.tree.map(
-                lambda leaf, new: jnp.where(done, jnp.broadcast_to(new, leaf.shape), leaf), tally, fresh
-            )
+            episodes = jax.vmap(lambda tally: episode_metrics(tally, self.measures))(tally)
+            summary = count_episodes(summary, episodes, done)
+            over = jax.vmap(lambda done, tally: jax.tree.map(lambda n, o: jnp.where(done, n, o), fresh, tally))
+            tally = over(done, tally)
             return (tally, summary), None
 
         steps = experience.transitions
         inputs = (steps.info, steps.terminated | steps.truncated)
-        loop = (tally, no_episodes(tally.total))
+        loop = (tally, no_episodes(self.measures))
         if self.num_steps == 1:
             return one_step(loop, jax.tree.map(lambda leaf: leaf[0], inputs))[0]
         return jax.lax.scan(one_step, loop, inputs)[0]
@@ -169,17 +162,17 @@ class Trainer:
             used = state.env_params
             state, episodes, metrics = self._update(state)
             seen = EpisodeSummary(
-                seen.ended + episodes.ended,
-                jax.tree.map(jnp.add, seen.total, episodes.total),
-                jax.tree.map(jnp.add, seen.squares, episodes.squares),
-                jax.tree.map(lambda new, old: jnp.where(episodes.ended > 0, new, old), episodes.last, seen.last),
+                ended=seen.ended + episodes.ended,
+                total=seen.total + episodes.total,
+                squares=seen.squares + episodes.squares,
+                last=jnp.where(episodes.ended > 0, episodes.last, seen.last),
             )
             return state, seen, jax.tree.map(jnp.add, totals, metrics), used
 
         shapes = jax.eval_shape(lambda: self._update(state)[2])
         zeros: PyTree = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         state, seen, totals, used = jax.lax.fori_loop(
-            0, num_updates, body, (state, no_episodes(state.tally.total), zeros, state.env_params)
+            0, num_updates, body, (state, no_episodes(self.measures), zeros, state.env_params)
         )
         metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), totals)
         return state, ChunkReport(seen, metrics, used)
@@ -196,3 +189,15 @@ class Trainer:
             return evaluate(env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes)
 
         return map_seeds(one, self.num_seeds)(learners)
+
+
+def _measures(env: Environment) -> list[str]:
+    """The names, sorted, of what a step of this task measures."""
+
+    def info() -> Metrics:
+        key, params = jax.random.key(0), env.default_params()
+        shape = (env.num_agents, env.num_actions)
+        action = jnp.zeros(shape) if env.continuous_actions else jnp.zeros(shape[0], jnp.int32)
+        return env.step(env.reset(key, params)[0], action, key, params)[1].info
+
+    return sorted(jax.eval_shape(info))

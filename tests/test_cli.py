@@ -1,0 +1,414 @@
+"""The command line: mistakes end in one sentence and exit code 2; what it writes and prints is what it says.
+
+All of it runs in one process on one tiny run; with xdist, on one worker.
+"""
+
+import contextlib
+import errno
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from gacrl import config as configuration
+from gacrl import envs, play
+from gacrl.cli import main
+from gacrl.envs import scripted
+from gacrl.evaluation.evaluate import evaluate, stream_key
+
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("cli")]
+
+EPISODES = 8
+TINY = [
+    *("--env-steps", "450", "--evaluation.interval", "150", "--env.max-cycles", "15"),
+    *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", str(EPISODES)),
+]
+
+
+class Trained(NamedTuple):
+    folder: Path
+    said: str
+
+
+@pytest.fixture(scope="module")
+def trained(quick_start: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """A run of 30 episodes, from a file of settings and flags over it."""
+    home = tmp_path_factory.mktemp("cli")
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["config", "--preset", "paper"]) == 0
+    (home / "settings.json").write_text(printed.getvalue())
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        words = ["train", "--config", str(home / "settings.json"), "--out", str(home / "run"), *TINY, "--json"]
+        assert main(words) == 0
+    return Trained(home / "run", said.getvalue())
+
+
+@pytest.fixture
+def copy(trained: Trained, tmp_path: Path) -> Path:
+    """The run, to be spoilt."""
+    return Path(shutil.copytree(trained.folder, tmp_path / "copy"))
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command that must fail as a user's mistake does, and gives its one sentence."""
+
+    def run(*words: object) -> str:
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("gacrl: ")
+        assert said.endswith("\n")
+        assert said.count("\n") == 1
+        return said.removeprefix("gacrl: ").removesuffix("\n")
+
+    return run
+
+
+@pytest.fixture
+def answered(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """Runs a command that must succeed, and gives the JSON object in its last line."""
+
+    def run(*words: object) -> Any:
+        capsys.readouterr()
+        assert main([*map(str, words), "--json"]) == 0
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    return run
+
+
+def content(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Every file's bytes and time of change."""
+    return {
+        str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def flip_a_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("words", "thing", "mend"),
+    [
+        ("trian", "unknown command 'trian'", "did you mean 'train'?"),
+        ("xyz", "unknown command 'xyz'", "gacrl --help"),
+        ("train --preset papre", "unknown preset 'papre'", "did you mean 'paper'?"),
+        ("config --preset papre", "unknown preset 'papre'", "did you mean 'paper'?"),
+        ("train --preset", "--preset needs a value", "gacrl train --help"),
+        ("train --config --json", "--config needs a value", "gacrl train --help"),
+        ("train --algorithm.learnig-rate 1", "--algorithm.learnig-rate", "did you mean --algorithm.learning-rate?"),
+        ("train --num-sedes 2", "--num-sedes", "did you mean --num-seeds?"),
+        ("evaluate random --episodse 2", "--episodse", "did you mean --episodes?"),
+        ("presets --nonsense", "--nonsense", "gacrl presets --help"),
+        ("doctor now", "now", "gacrl doctor --help"),
+        ("train --seed", "'--seed'", "gacrl train --help"),
+        ("evaluate", "run", "gacrl evaluate --help"),
+        ("train --env.num-agents 0", "env.num_agents must be between 1 and 10000, not 0", "gacrl train --help"),
+        ("train --env.num-agents three", "--env.num-agents", "gacrl train --help"),
+        ("train --env-steps many", "--env-steps", "gacrl train --help"),
+        ("train --env.reward mpe", "'mpe'", "('mpe2', 'paper')"),
+        ("train --algorithm.encoder-hidden a", "--algorithm.encoder-hidden", "gacrl train --help"),
+        ("train --algorithm.learning-rate nan", "algorithm.learning_rate", "between 0 and 1"),
+        ("train --algorithm.epsilon 0.9", "algorithm.epsilon", "must not exceed 1"),
+        ("train --num-seeds 0", "num_seeds", "between 1 and 10000"),
+        ("train --seed -1", "seed", "between 0 and 2147483647"),
+        ("train --env-steps 0", "training.env_steps", "at least 1|between 1 and"),
+        ("train --episodes 0", "training.env_steps", "at least 1|between 1 and"),
+        ("train --episodes 1 --env-steps 9", "--env-steps and --episodes", "give one of them"),
+        ("train --env.continuous-actions", "needs discrete actions", "leave env.continuous_actions at False"),
+        ("train --out /dev/null/run", "/dev/null/run", "choose another with --out"),
+        ("train --config none.json", "none.json", "gacrl config"),
+        ("resume nowhere", "there is no run nowhere", "gacrl train"),
+        ("resume nowhere --extend 0", "--extend", "at least 1"),
+        ("resume .", "is not a run folder", "config.json"),
+        ("evaluate nowhere", "there is no run nowhere", "gacrl train"),
+        ("evaluate nowhere@1", "there is no run nowhere", "gacrl train"),
+        ("evaluate random --episodes 0", "--episodes", "at least 1"),
+        ("evaluate random --horizon 0", "env.max_cycles", "between 1 and"),
+        ("evaluate random --num-agents 0", "env.num_agents", "between 1 and"),
+        ("evaluate random --arena-scale nan", "env.arena_scale", "between 0.001 and"),
+        ("evaluate random --backend mpe", "'mpe'", "'mpe2'"),
+        ("evaluate random --backend mpe2 --arena-scale 2", "arena scale of 2", "--backend jax"),
+        ("render random --episodes 0", "--episodes", "between 1 and 100"),
+        ("render random --size 5000", "--size", "between 64 and 4096"),
+        ("render random --out no/folder.gif", "no folder no", "folder.gif"),
+    ],
+)
+def test_a_mistake_ends_in_one_sentence(
+    words: str,
+    thing: str,
+    mend: str,
+    refused: Callable[..., str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(tmp_path)
+    said = refused(*words.split())
+    assert thing in said
+    assert any(way in said for way in mend.split("|"))
+    assert list(tmp_path.iterdir()) == [], "a mistake leaves nothing behind"
+
+
+@pytest.mark.parametrize(
+    ("text", "thing"),
+    [
+        ("not json", "is not JSON"),
+        ("[1]", "must hold a JSON object"),
+        ('{"env": {"num_agent": 4}}', "did you mean 'env.num_agents'?"),
+        ('{"env": {"num_agents": "4"}}', "env.num_agents must be a whole number, not '4'"),
+        ('{"env": {"local_ratio": NaN}}', "env.local_ratio must be between 0 and 1, not nan"),
+    ],
+)
+def test_a_file_of_settings_that_cannot_be_is_named(
+    text: str, thing: str, refused: Callable[..., str], tmp_path: Path
+):
+    path = tmp_path / "my.json"
+    path.write_text(text)
+    said = refused("train", "--config", path, "--out", tmp_path / "run")
+    assert thing in said
+    assert str(path) in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_exists_is_not_overwritten(copy: Path, refused: Callable[..., str], tmp_path: Path):
+    before = content(copy)
+    said = refused("train", "--out", copy, *TINY)
+    assert f"{copy} exists" in said
+    assert f"gacrl resume {copy}" in said
+    assert content(copy) == before
+
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work")
+    said = refused("train", "--out", other, *TINY)
+    assert said == f"{other} exists and is not overwritten: choose another --out"
+    assert f"{other / 'thesis.tex'} exists" in refused("train", "--out", other / "thesis.tex", *TINY)
+    assert {name: data for name, (data, _) in content(other).items()} == {"thesis.tex": b"years of work"}
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(copy: Path, refused: Callable[..., str]):
+    settings = json.loads((copy / "config.json").read_text())
+    settings["algorithm"]["latent_size"] = 8
+    (copy / "config.json").write_text(json.dumps(settings))
+    before = content(copy)
+    said = refused("evaluate", copy)
+    assert "step-000000000450 holds another architecture" in said
+    assert "float32[1, 32, 32] there and float32[1, 16, 32] here" in said
+    assert "use the config.json that it was trained with" in said
+    said = refused("resume", copy)
+    assert "was trained with other settings" in said
+    assert "put the file back" in said
+    before.pop(".lock", None)
+    assert {name: it for name, it in content(copy).items() if name != ".lock"} == before
+
+
+def test_a_run_folder_without_its_settings_or_with_broken_ones_is_refused(copy: Path, refused: Callable[..., str]):
+    (copy / "config.json").write_text('{"env": ')
+    for command in ("evaluate", "resume", "render"):
+        assert f"{copy / 'config.json'} is not JSON" in refused(command, copy)
+    (copy / "config.json").unlink()
+    for command in ("evaluate", "resume", "render"):
+        assert f"{copy} is not a run folder" in refused(command, copy)
+
+
+def test_members_that_are_not_there_are_refused(trained: Trained, refused: Callable[..., str]):
+    assert "has the members 0 to 0: there is no @1" in refused("evaluate", f"{trained.folder}@1")
+    assert "leave --num-agents out" in refused("evaluate", trained.folder, "--num-agents", 4)
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_none_is_refused(
+    copy: Path, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+):
+    newest, older = copy / "checkpoints/step-000000000450", copy / "checkpoints/step-000000000300"
+    flip_a_byte(newest / "state.safetensors")
+    assert main(["render", str(copy), "--out", str(copy / "old.gif"), "--episodes", "1", "--size", "64"]) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith(f"gacrl: checkpoint {newest} is damaged")
+    assert said.endswith("taking the one before it\n")
+
+    (older / "manifest.json").write_text("{}")
+    for command in ("evaluate", "resume", "render"):
+        said = refused(command, copy)
+        assert f"every checkpoint in {copy / 'checkpoints'} is damaged" in said
+        assert "train the run again" in said
+    shutil.rmtree(newest)
+    shutil.rmtree(older)
+    assert "is missing" in refused("evaluate", copy)
+
+
+def no_space(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_at_the_start_is_told(
+    refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(os, "fsync", no_space)
+    said = refused("train", "--out", tmp_path / "run", *TINY)
+    assert f"cannot write the run folder {tmp_path / 'run'}: No space left on device" in said
+
+
+def test_a_disk_that_fills_up_leaves_a_run_that_goes_on(
+    copy: Path, refused: Callable[..., str], answered: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+):
+    real, rows = os.fsync, (copy / "metrics.jsonl").read_text()
+
+    def fsync(descriptor: int) -> None:
+        if "600" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            no_space()
+        real(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fsync)
+        said = refused("resume", copy, "--extend", 150)
+    assert f"cannot write to {copy}: No space left on device" in said
+    assert f"`gacrl resume {copy}` goes on from the last checkpoint" in said
+
+    assert answered("resume", copy)["env_steps"] == 600
+    assert (copy / "metrics.jsonl").read_text().startswith(rows)
+    steps = [json.loads(row)["env_steps"] for row in (copy / "metrics.jsonl").read_text().splitlines()]
+    assert steps == [150, 300, 450, 600]
+
+
+def test_training_leaves_what_it_says(trained: Trained):
+    folder, said = trained
+    settings = configuration.load(folder / "config.json")
+    assert settings.env == configuration.preset("paper").env.__class__(
+        **{**vars(configuration.preset("paper").env), "max_cycles": 15}
+    )
+    assert settings.training.env_steps == 450
+    assert settings.algorithm == configuration.preset("paper").algorithm
+
+    rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_steps"] for row in rows] == [150, 300, 450]
+    assert [row["episodes_done"] for row in rows] == [10, 20, 30]
+    assert all(row["seed"] == 0 and row["train"]["episodes"] == 10 for row in rows)
+    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [
+        "step-000000000300",
+        "step-000000000450",
+    ]
+    assert sorted(path.name for path in (folder / "episodes").iterdir()) == [f"{k}.npz" for k in range(4)]
+    with Image.open(folder / "episodes.gif") as picture:
+        assert picture.n_frames > 15
+
+    summary = json.loads((folder / "summary.json").read_text())
+    told = json.loads(said.splitlines()[-1])
+    assert told == {"folder": str(folder), "env_steps": 450, "summary": summary}
+    assert summary["final"]["greedy"]["score_return_agent_mean"]["mean"] == pytest.approx(
+        (summary["final"]["greedy"]["return_agent_mean"]["mean"] - summary["references"]["random"]["return_agent_mean"])
+        / (summary["references"]["oracle"]["return_agent_mean"] - summary["references"]["random"]["return_agent_mean"])
+    )
+    lines = said.splitlines()
+    assert f"run        {folder}" in lines, "a path is not broken over lines"
+    assert f"summary    {folder / 'summary.json'}" in lines
+    assert sum(line.startswith("episode ") and "steps/s" in line for line in lines) == 3
+    assert any(line.startswith("Table III") for line in lines)
+
+
+def test_presets_and_settings_are_printed(answered: Callable[..., Any], capsys: pytest.CaptureFixture[str]):
+    assert set(answered("presets")) == set(configuration.PRESETS)
+    for name, (_, settings) in configuration.PRESETS.items():
+        assert main(["config", "--preset", name]) == 0
+        assert capsys.readouterr().out == configuration.dumps(settings)
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("gacrl 0.")
+    assert main([]) == 0
+    assert "usage: gacrl COMMAND" in capsys.readouterr().out
+
+
+def test_help_shows_what_a_preset_and_a_file_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "my.json").write_text('{"env": {"num_agents": 77}}')
+    with pytest.raises(SystemExit, match="0"):
+        main(["train", "--config", str(tmp_path / "my.json"), "--help"])
+    said = capsys.readouterr().out
+    assert "(default: 77)" in said
+    assert "examples:" in said
+
+
+def test_scripted_policies_stand_on_their_own_scale(answered: Callable[..., Any]):
+    scores = {
+        name: answered("evaluate", name, "--episodes", EPISODES, "--horizon", 15)
+        for name in ("random", "noop", "oracle")
+    }
+    for name, score in scores.items():
+        assert score["episodes"] == EPISODES
+        assert score["horizon"] == 15
+        assert score["references"] == scores["random"]["references"], "every policy plays the same starts"
+        greedy = score["final"]["greedy"]
+        assert greedy["return_agent_mean"]["mean"] == score["references"][name]["return_agent_mean"]
+    for name, worth in (("random", 0.0), ("oracle", 1.0)):
+        greedy = scores[name]["final"]["greedy"]
+        assert {greedy[metric]["mean"] for metric in greedy if metric.startswith("score_")} == {worth}
+
+
+def test_evaluating_a_run_again_gives_its_summary(trained: Trained, answered: Callable[..., Any]):
+    again = answered("evaluate", trained.folder, "--episodes", EPISODES)
+    summary = json.loads((trained.folder / "summary.json").read_text())
+    assert again["references"] == summary["references"]
+    assert again["final"] == summary["final"]
+    assert again["horizon"] == summary["horizon"] == 15
+
+
+def test_the_real_mpe2_gives_the_same_within_sampling_error(trained: Trained, answered: Callable[..., Any]):
+    episodes = 100
+    there = answered("evaluate", trained.folder, "--backend", "mpe2", "--episodes", episodes)
+    assert there["backend"] == "mpe2"
+
+    opened = play.open_run(trained.folder)
+    env = envs.make(opened.config.env)
+    noop, memory = scripted.make("noop", env)
+    ours = {
+        "greedy": opened.trainer.evaluate(opened.learners, False, "report", episodes),
+        "sampled": opened.trainer.evaluate(opened.learners, True, "report", episodes),
+        "noop": jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("report"), episodes))(),
+    }
+    for who, metrics in ours.items():
+        for name in ("return_agent_mean", "distance_landmark_agent", "coverage_mean_0.5", "reward_shaped"):
+            values = np.asarray(metrics[name]).reshape(-1)
+            theirs = there["references"]["noop"][name] if who == "noop" else there["final"][who][name]["mean"]
+            error = values.std() * np.sqrt(2 / episodes)
+            assert abs(values.mean() - theirs) < 4 * error, (who, name)
+            assert error < 0.5 * abs(values.mean()), "the test can fail"
+
+
+def frames(path: Path) -> Iterator[np.ndarray]:
+    with Image.open(path) as picture:
+        for number in range(picture.n_frames):
+            picture.seek(number)
+            yield np.asarray(picture.convert("RGB"))
+
+
+def test_a_rendered_episode_moves_and_is_not_overwritten(
+    trained: Trained, refused: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "run.gif"
+    words = ["render", str(trained.folder), "--out", str(out), "--episodes", "1", "--size", "96"]
+    assert main(words) == 0
+    assert f"{out}: 1 episode" in capsys.readouterr().out
+    shown = list(frames(out))
+    assert len(shown) == 16, "15 steps and where they started"
+    assert any((frame != shown[0]).any() for frame in shown[1:])
+    assert max(shown[0].shape) >= 96
+
+    before = out.read_bytes()
+    assert f"{out} exists" in refused(*words)
+    assert out.read_bytes() == before
+    words[words.index("--episodes") + 1] = "2"
+    assert main([*words, "--overwrite"]) == 0
+    assert len(list(frames(out))) == 32
