@@ -169,9 +169,9 @@ def parse(kind: type[Arguments], words: list[str], command: str, default: Argume
 
 def _sentence(box: str, command: str) -> str:
     """One sentence out of the parser's box: what is wrong, and the nearest option there is."""
-    lines = [line.strip("│╭╮╰╯─ ") for line in box.splitlines()]
-    lines = lines[1:] if lines else lines  # the box's title
-    problem = " ".join(lines[: lines.index("")]) if "" in lines else " ".join(lines)
+    lines = [line.strip("│ ") for line in box.splitlines()[1:]]  # the first one is the box's title
+    lines = [line if line.strip("╰╯─-") else "" for line in lines]
+    problem = "\n".join(lines).strip().split("\n\n")[0].replace("\n", " ")
     problem = re.sub(r"^Error parsing (?!--)\S+: ", "", problem).rstrip(". ")
     problem = problem[:1].lower() + problem[1:]
     wrong = re.findall(r"--[\w.-]+", problem)

@@ -182,8 +182,8 @@ def _render(words: list[str]) -> int:
     asked = arguments.parse(arguments.Render, words, "render")
     if not 1 <= asked.episodes <= 100:
         raise UserError(f"--episodes must be between 1 and 100, not {asked.episodes}")
-    if not 64 <= asked.size <= 4096:
-        raise UserError(f"--size must be between 64 and 4096 pixels, not {asked.size}")
+    if not 120 <= asked.size <= 4096:
+        raise UserError(f"--size must be between 120 and 4096 pixels, not {asked.size}")
     if asked.out.exists() and not asked.overwrite:
         raise UserError(f"{asked.out} exists: choose another --out, or say --overwrite")
     if not asked.out.parent.is_dir():

@@ -16,6 +16,7 @@ from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
 from gacrl.training import checkpoint, session
+from gacrl.training.devices import one_seed
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
 from gacrl.types import Channel, Memory, Policy
@@ -40,8 +41,7 @@ class TrainedRun:
 
     def policy(self, member: int, explore: bool) -> Policy:
         """The policy of one seed."""
-        learner = jax.tree.map(lambda leaf: leaf[member], jax.device_get(self.learners))
-        return self.trainer.algorithm.policy(learner, explore)
+        return self.trainer.algorithm.policy(one_seed(self.learners, member), explore)
 
 
 def open_run(

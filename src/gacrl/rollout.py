@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Key
 
 from gacrl.envs.environment import Environment, EnvParams, EnvState
 from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Rollout, Transition
@@ -39,8 +39,8 @@ def step(
     """Every environment takes one step; those whose episode ended are reset, with fresh memory."""
     channel = Channel() if channel is None else channel
 
-    def one(carry: Carry, key: PRNGKey) -> tuple[Carry, Transition]:
-        act_key, env_key, reset_key = jax.random.split(key, 3)
+    def one(carry: Carry, keys: Key[Array, " 3"]) -> tuple[Carry, Transition]:
+        act_key, env_key, reset_key = keys
         decision, memory = policy(carry.memory, carry.observation, act_key, channel)
         env_state, after = env.step(carry.env_state, decision.action, env_key, params)
         done = after.terminated | after.truncated
@@ -59,7 +59,7 @@ def step(
         env_state, observation, memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, going_on)
         return Carry(env_state, observation, memory, done), transition
 
-    return jax.vmap(one)(carry, jax.random.split(key, carry.first.shape[0]))
+    return jax.vmap(one)(carry, jax.random.split(key, (carry.first.shape[0], 3)))
 
 
 def collect(

@@ -19,7 +19,10 @@ def item(number):
     return Item(jnp.int32(number), jnp.array([10.0 * number, -number]))
 
 
-add, sample = jax.jit(replay.add), jax.jit(replay.sample, static_argnums=2)
+add = jax.jit(replay.add)
+sample = jax.jit(
+    lambda ring, key, size: replay.take(ring, replay.sample_rows(ring, key, size)), static_argnums=2
+)
 
 
 def filled(count, capacity=4):

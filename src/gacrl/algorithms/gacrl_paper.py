@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl.algorithms import replay as ring
@@ -29,7 +30,7 @@ from gacrl.envs.environment import Environment
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
 from gacrl.networks.graph import neighbour_sum, observed_adjacency
 from gacrl.networks.layers import Linear
-from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, transmit
+from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel, transmit
 from gacrl.types import (
     Channel,
     Decision,
@@ -122,6 +123,24 @@ class Noise(NamedTuple):
     gumbel: Float[Array, "V N *b"]
 
 
+def draw_noise(
+    key: PRNGKey, num_agents: int, num_actions: int, config: GacrlPaperConfig, *batch: int
+) -> tuple[Noise, Float[Array, "N A"]]:
+    """The noise of a forward pass, and Gumbel noise to choose the actions with (none for 0 actions).
+
+    One draw serves all: a call of the generator costs more than the few numbers in it.
+    """
+    num_latent = config.latent_size * num_agents * prod(batch)
+    num_gumbel = config.vocabulary * num_agents * prod(batch)
+    num_choice = num_agents * num_actions
+    normal, gumbel = normal_and_gumbel(key, num_latent, num_gumbel + num_choice)
+    noise = Noise(
+        normal.reshape(config.latent_size, num_agents, *batch),
+        gumbel[:num_gumbel].reshape(config.vocabulary, num_agents, *batch),
+    )
+    return noise, gumbel[num_gumbel:].reshape(num_agents, num_actions)
+
+
 class Forward(NamedTuple):
     """What one forward pass over one environment's agents computes, a column for each agent."""
 
@@ -212,7 +231,8 @@ class Hyper(NamedTuple):
 class LearnerState(NamedTuple):
     network: Network
     optimizer: optax.OptState
-    replay: ring.Replay[Experience]
+    replay: ring.Replay[Float[Array, "capacity W"]]
+    """Of experiences, each packed into one vector."""
     coverage: Coverage
     hyper: Hyper
 
@@ -286,7 +306,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
     """The paper's algorithm for this task's shapes. Needs discrete actions and a team without padding."""
     num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
     straight_through = config.messages == "straight_through"
-    adam = optax.scale_by_adam()
+    adam = optax.flatten(optax.scale_by_adam())  # one vector: a kernel for each of 28 arrays costs more
     hyper = Hyper(
         learning_rate=config.learning_rate,
         learning_rate_end=config.learning_rate_end,
@@ -298,6 +318,15 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
         kl_weight=config.kl_weight,
     )
 
+    blank = Experience(
+        features=jnp.zeros((num_agents, observation_size)),
+        adjacency=jnp.zeros((num_agents, num_agents), bool),
+        action=jnp.zeros(num_agents, jnp.int32),
+        reward=jnp.zeros(()),
+    )
+    # One vector an item: XLA copies rings of small items whole where it reads what it has just written.
+    packed_blank, unpack = ravel_pytree(blank)
+
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
         policy_input = observation_size + config.vocabulary * (num_agents - 1) + config.latent_size
@@ -307,16 +336,10 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             PolicyNetwork(policy_input, config.policy_hidden, num_actions, policy_key),
             Critic(observation_size * num_agents, config.critic_hidden, critic_key),
         )
-        blank = Experience(
-            features=jnp.zeros((num_agents, observation_size)),
-            adjacency=jnp.zeros((num_agents, num_agents), bool),
-            action=jnp.zeros(num_agents, jnp.int32),
-            reward=jnp.zeros(()),
-        )
         return LearnerState(
             network=network,
             optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            replay=ring.empty(blank, config.replay_capacity),
+            replay=ring.empty(packed_blank, config.replay_capacity),
             coverage=no_coverage(),
             hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
         )
@@ -330,24 +353,13 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             adaptive_level(hyper.temperature, episode, hyper.num_episodes, coverage),
         )
 
-    def draw_noise(key: PRNGKey, *batch: int) -> Noise:
-        latent_key, gumbel_key = jax.random.split(key)
-        latent_shape = (config.latent_size, num_agents, *batch)
-        gumbel_shape = (config.vocabulary, num_agents, *batch)
-        # Drawn flat: the counter-based generator is several times slower on many axes.
-        return Noise(
-            jax.random.normal(latent_key, (prod(latent_shape),)).reshape(latent_shape),
-            jax.random.gumbel(gumbel_key, (prod(gumbel_shape),)).reshape(gumbel_shape),
-        )
-
     def policy(learner: LearnerState, explore: bool) -> Policy:
         epsilon, temperature = levels(learner)
 
         def act(
             memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
         ) -> tuple[Decision, Memory]:
-            noise_key, action_key, channel_key = jax.random.split(key, 3)
-            noise = draw_noise(noise_key) if explore else None
+            noise, choice = draw_noise(key, num_agents, num_actions, config) if explore else (None, None)
             adjacency = observed_adjacency(observation, learner.hyper.radius)
             output, memory = forward(
                 learner.network,
@@ -357,15 +369,14 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
                 noise,
                 straight_through,
                 channel,
-                channel_key,
+                jax.random.fold_in(key, 1),
                 memory,
             )
             logits = jnp.where(observation.action_mask, output.logits.T, -jnp.inf)
-            if explore:
-                probabilities = behaviour_probabilities(logits, epsilon)
-                action = jax.random.categorical(action_key, jnp.log(probabilities))
-            else:
+            if choice is None:
                 action = logits.argmax(-1)
+            else:  # the largest of log p + Gumbel noise is a sample of p
+                action = (jnp.log(behaviour_probabilities(logits, epsilon)) + choice).argmax(-1)
             extras: dict[str, Any] = {"value": learner.network.critic(observation.features)}
             if noise is not None:
                 extras["noise"] = noise
@@ -383,12 +394,13 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             step.decision.action,
             step.reward.mean(),
         )
-        replay = ring.add(learner.replay, current)
-        batch = ring.sample(replay, sample_key, config.batch_size)
-        rows = jax.tree.map(lambda past, now: jnp.concatenate([past, now[None]]), batch, current)
+        replay = ring.add(learner.replay, ravel_pytree(current)[0])
+        sampled = ring.sample_rows(replay, sample_key, config.batch_size)
+        rows = jax.vmap(unpack)(ring.take(replay, jnp.append(sampled, ring.newest(replay))))
+        fresh, _ = draw_noise(noise_key, num_agents, 0, config, config.batch_size)
         noise = jax.tree.map(
             lambda fresh, acted: jnp.concatenate([fresh, acted[..., None]], axis=-1),
-            draw_noise(noise_key, config.batch_size),
+            fresh,
             step.decision.extras["noise"],
         )
         gradients, losses = jax.grad(loss, has_aux=True)(

@@ -46,7 +46,20 @@ def add(replay: Replay[Item], item: Item) -> Replay[Item]:
     return Replay(items, replay.added + 1)
 
 
-def sample(replay: Replay[Item], key: PRNGKey, batch_size: int) -> Item:
-    """A uniform batch, with replacement; there must be at least one item."""
-    rows = jax.random.randint(key, (batch_size,), 0, replay.size)
-    return jax.tree.map(lambda ring: ring[rows], replay.items)
+def newest(replay: Replay[Item]) -> Int[Array, ""]:
+    """The row of the item that was added last."""
+    return (replay.added - 1) % replay.capacity
+
+
+def sample_rows(replay: Replay[Item], key: PRNGKey, batch_size: int) -> Int[Array, " B"]:
+    """Uniform rows, with replacement; there must be at least one item.
+
+    The remainder of 32 random bits: no row is favoured by more than one part in 2³² / size.
+    """
+    bits = jax.random.bits(key, (batch_size,), jnp.uint32)
+    return (bits % replay.size.astype(jnp.uint32)).astype(jnp.int32)
+
+
+def take(replay: Replay[Item], rows: Int[Array, " B"]) -> Item:
+    """The items in these rows."""
+    return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), replay.items)

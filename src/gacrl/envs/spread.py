@@ -255,12 +255,10 @@ class Spread:
         }
 
     def _place(self, key: PRNGKey, params: SpreadParams) -> SpreadState:
-        place_key, heading_key = jax.random.split(key)
-        places = jax.random.uniform(
-            place_key, (self.num_agents + self.num_landmarks, 2), dtype=float, minval=-1.0, maxval=1.0
-        )
-        places *= params.arena_scale
-        heading = jax.random.uniform(heading_key, (self.num_landmarks,), dtype=float, maxval=2 * jnp.pi)
+        entities = self.num_agents + self.num_landmarks
+        draws = jax.random.uniform(key, (2 * entities + self.num_landmarks,), dtype=float, minval=-1.0, maxval=1.0)
+        places = draws[: 2 * entities].reshape(entities, 2) * params.arena_scale
+        heading = jnp.pi * draws[2 * entities :]
         speed = params.landmark_speed * params.physics.top_speed
         return SpreadState(
             positions=places[: self.num_agents],

@@ -1,8 +1,8 @@
 """Checkpoints: safetensors and a JSON manifest, written so that a crash at any moment leaves a good one.
 
 A checkpoint is a folder `step-000000003750` with `state.safetensors` and `manifest.json` (format version,
-fingerprint of the configuration, SHA-256 of the tensors, counters). It is written under another name, synced
-to the disk, and renamed. No pickle, nothing that can run code.
+fingerprint of the configuration, counters, SHA-256 of the tensors and of all this). It is written under
+another name, synced to the disk, and renamed. No pickle, nothing that can run code.
 """
 
 import hashlib
@@ -46,13 +46,14 @@ def save(folder: Path, state: PyTree, env_steps: int, fingerprint: str, counters
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     tensors = safetensors.numpy.save(_to_arrays(state))
-    manifest = {
+    manifest: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "env_steps": env_steps,
         "fingerprint": fingerprint,
         "counters": counters,
         "sha256": {_TENSORS: hashlib.sha256(tensors).hexdigest()},
     }
+    manifest["checksum"] = _digest(manifest)
     _write_synced(unfinished / _TENSORS, tensors)
     _write_synced(unfinished / _MANIFEST, json.dumps(manifest, indent=2).encode())
     _sync_folder(unfinished)
@@ -112,10 +113,16 @@ def _inspect(folder: Path) -> Checkpoint:
     manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
     if manifest["format_version"] != FORMAT_VERSION:
         raise ValueError(f"format version {manifest['format_version']}, this program reads {FORMAT_VERSION}")
+    if manifest.pop("checksum") != _digest(manifest):
+        raise ValueError(f"{_MANIFEST} does not match its checksum")
     for name, digest in manifest["sha256"].items():
         if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
             raise ValueError(f"{name} does not match its checksum")
     return Checkpoint(folder, int(manifest["env_steps"]), manifest["fingerprint"], manifest["counters"])
+
+
+def _digest(manifest: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _folders(folder: Path) -> list[Path]:
@@ -127,12 +134,12 @@ def _to_arrays(state: PyTree) -> dict[str, np.ndarray]:
     def plain(leaf: jax.Array) -> np.ndarray:
         if _is_key(leaf):
             leaf = jax.random.key_data(leaf)
-        return np.ascontiguousarray(leaf)
+        return np.asarray(leaf, order="C")
 
     return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
 
 
-def _is_key(leaf: jax.Array) -> bool:
+def _is_key(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 

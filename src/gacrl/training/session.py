@@ -22,7 +22,7 @@ from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint, curriculum
-from gacrl.training.devices import devices_for, shard_seeds, without_padding
+from gacrl.training.devices import devices_for, one_seed, shard_seeds, without_padding
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
@@ -192,8 +192,7 @@ def _finish(
         "versions": versions(),
     }
     folder.write_summary(summary)
-    learner = jax.tree.map(lambda leaf: leaf[0], jax.device_get(state.learner))
-    policy = trainer.algorithm.policy(learner, False)
+    policy = trainer.algorithm.policy(one_seed(state.learner, 0), False)
     shown = episodes.record_many(
         env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
     )

@@ -25,7 +25,7 @@ from gacrl.evaluation.metrics import (
     no_steps,
 )
 from gacrl.training.curriculum import Curriculum, CurriculumState
-from gacrl.training.devices import map_seeds, shard_seeds, stack_seeds
+from gacrl.training.devices import compiler_options, map_seeds, shard_seeds, stack_seeds
 from gacrl.types import Learner, Metrics, PRNGKey
 
 
@@ -82,7 +82,9 @@ class Trainer:
         self.measures = _measures(env)
         self.metric_names = metric_names(self.measures)
         """What the vectors of a chunk's episode summary hold."""
-        self.chunk = jax.jit(map_seeds(self.chunk_of_one, num_seeds), donate_argnums=0)
+        self.chunk = jax.jit(
+            map_seeds(self.chunk_of_one, num_seeds), donate_argnums=0, compiler_options=compiler_options()
+        )
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
         """Fresh training states of these seeds, stacked."""
