@@ -1,6 +1,6 @@
 """The command line: mistakes end in one sentence and exit code 2; what it writes and prints is what it says.
 
-All of it runs in one process on one tiny run; with xdist, on one worker.
+All of it runs in one process on one tiny run of two seeds; with xdist, on one worker.
 """
 
 import contextlib
@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,12 +25,15 @@ from gacrl.cli import main
 from gacrl.envs import scripted
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.experiments import paper_tables
+from gacrl.training import checkpoint
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("cli")]
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
 EPISODES = 8
 TINY = [
-    *("--env-steps", "450", "--evaluation.interval", "150", "--env.max-cycles", "15"),
+    *("--env-steps", "450", "--evaluation.interval", "150", "--num-seeds", "2"),
+    # The rest decides what is compiled: as in training/test_resume.py.
+    *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
     *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", str(EPISODES)),
 ]
 
@@ -50,7 +54,7 @@ def quick_tables() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def trained(quick_start: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """A run of 30 episodes, from a file of settings and flags over it."""
+    """Two seeds, 30 episodes each, from a file of settings and flags over it."""
     home = tmp_path_factory.mktemp("cli")
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
@@ -218,7 +222,7 @@ def test_a_checkpoint_of_another_architecture_is_refused(copy: Path, refused: Ca
     before = content(copy)
     said = refused("evaluate", copy)
     assert "step-000000000450 holds another architecture" in said
-    assert "float32[1, 32, 32] there and float32[1, 16, 32] here" in said
+    assert "float32[2, 32, 32] there and float32[2, 16, 32] here" in said
     assert "use the config.json that it was trained with" in said
     said = refused("resume", copy)
     assert "was trained with other settings" in said
@@ -237,7 +241,7 @@ def test_a_run_folder_without_its_settings_or_with_broken_ones_is_refused(copy: 
 
 
 def test_members_that_are_not_there_are_refused(trained: Trained, refused: Callable[..., str]):
-    assert "has the members 0 to 0: there is no @1" in refused("evaluate", f"{trained.folder}@1")
+    assert "has the members 0 to 1: there is no @2" in refused("evaluate", f"{trained.folder}@2")
     assert "leave --num-agents out" in refused("evaluate", trained.folder, "--num-agents", 4)
 
 
@@ -246,7 +250,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_none_is_refused(
 ):
     newest, older = copy / "checkpoints/step-000000000450", copy / "checkpoints/step-000000000300"
     flip_a_byte(newest / "state.safetensors")
-    assert main(["render", str(copy), "--out", str(copy / "old.gif"), "--episodes", "1", "--size", "120"]) == 0
+    assert main(["render", str(copy), "--out", str(copy / "old.gif"), "--size", "120"]) == 0
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith(f"gacrl: checkpoint {newest} is damaged")
@@ -274,41 +278,41 @@ def test_a_full_disk_at_the_start_is_told(
     assert f"cannot write the run folder {tmp_path / 'run'}: No space left on device" in said
 
 
-def test_a_disk_that_fills_up_leaves_a_run_that_goes_on(
-    copy: Path, refused: Callable[..., str], answered: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+def test_a_disk_that_fills_up_leaves_a_run_that_can_go_on(
+    copy: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ):
-    real, rows = os.fsync, (copy / "metrics.jsonl").read_text()
+    real, before = os.fsync, content(copy / "checkpoints")
 
     def fsync(descriptor: int) -> None:
-        if "600" in os.readlink(f"/proc/self/fd/{descriptor}"):
+        if "step-000000000600" in os.readlink(f"/proc/self/fd/{descriptor}"):
             no_space()
         real(descriptor)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fsync)
-        said = refused("resume", copy, "--extend", 150)
+    monkeypatch.setattr(os, "fsync", fsync)
+    said = refused("resume", copy, "--extend", 150)
     assert f"cannot write to {copy}: No space left on device" in said
     assert f"`gacrl resume {copy}` goes on from the last checkpoint" in said
 
-    assert answered("resume", copy)["env_steps"] == 600
-    assert (copy / "metrics.jsonl").read_text().startswith(rows)
-    steps = [json.loads(row)["env_steps"] for row in (copy / "metrics.jsonl").read_text().splitlines()]
-    assert steps == [150, 300, 450, 600]
+    after = content(copy / "checkpoints")
+    assert {name: after[name] for name in before} == before
+    found, warnings = checkpoint.newest(copy / "checkpoints")
+    assert found.env_steps == 450
+    assert warnings == []
+    assert found.fingerprint == configuration.fingerprint(configuration.load(copy / "config.json"))
 
 
 def test_training_leaves_what_it_says(trained: Trained):
     folder, said = trained
-    settings = configuration.load(folder / "config.json")
-    assert settings.env == configuration.preset("paper").env.__class__(
-        **{**vars(configuration.preset("paper").env), "max_cycles": 15}
-    )
-    assert settings.training.env_steps == 450
-    assert settings.algorithm == configuration.preset("paper").algorithm
+    preset, settings = configuration.preset("paper"), configuration.load(folder / "config.json")
+    assert settings.env == replace(preset.env, max_cycles=15)
+    assert settings.algorithm == replace(preset.algorithm, replay_capacity=500)
+    assert (settings.training.env_steps, settings.seeds) == (450, (0, 1))
 
     rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
-    assert [row["env_steps"] for row in rows] == [150, 300, 450]
-    assert [row["episodes_done"] for row in rows] == [10, 20, 30]
-    assert all(row["seed"] == 0 and row["train"]["episodes"] == 10 for row in rows)
+    assert [row["env_steps"] for row in rows] == [150, 150, 300, 300, 450, 450]
+    assert [row["episodes_done"] for row in rows] == [10, 10, 20, 20, 30, 30]
+    assert [row["seed"] for row in rows] == [0, 1] * 3
+    assert all(row["train"]["episodes"] == 10 for row in rows)
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [
         "step-000000000300",
         "step-000000000450",
@@ -320,19 +324,23 @@ def test_training_leaves_what_it_says(trained: Trained):
     summary = json.loads((folder / "summary.json").read_text())
     told = json.loads(said.splitlines()[-1])
     assert told == {"folder": str(folder), "env_steps": 450, "summary": summary}
-    assert summary["final"]["greedy"]["score_return_agent_mean"]["mean"] == pytest.approx(
-        (summary["final"]["greedy"]["return_agent_mean"]["mean"] - summary["references"]["random"]["return_agent_mean"])
-        / (summary["references"]["oracle"]["return_agent_mean"] - summary["references"]["random"]["return_agent_mean"])
-    )
+    greedy = summary["final"]["greedy"]["return_agent_mean"]
+    low, high = (summary["references"][who]["return_agent_mean"] for who in ("random", "oracle"))
+    assert greedy["mean"] == pytest.approx(np.mean(greedy["values"]))
+    assert greedy["interval"][0] < greedy["mean"] < greedy["interval"][1]
+    score = summary["final"]["greedy"]["score_return_agent_mean"]
+    assert score["values"] == pytest.approx([(value - low) / (high - low) for value in greedy["values"]])
     lines = said.splitlines()
     assert f"run        {folder}" in lines, "a path is not broken over lines"
     assert f"summary    {folder / 'summary.json'}" in lines
     assert sum(line.startswith("episode ") and "steps/s" in line for line in lines) == 3
     table = next(number for number, line in enumerate(lines) if line.startswith("Table III"))
     assert lines[table + 2].split()[:4] == ["episode", "who", "Sh.", "Reward"]
-    assert [line.split()[1] for line in lines[table + 4 : table + 9]] == ["paper", "ours,", "random", "noop", "oracle"]
+    assert [line.split()[1] for line in lines[table + 4 : table + 10]] == [
+        *("paper", "ours,", "ours,", "random", "noop", "oracle")
+    ]
     assert "9.12 ± 3.87" in lines[table + 4], "the paper's own number"
-    assert lines[table + 6].split()[2:] == ["12.50", "±", "0.25", "0.50", "±", "0.25"]
+    assert lines[table + 7].split()[2:] == ["12.50", "±", "0.25", "0.50", "±", "0.25"]
 
 
 def test_presets_and_settings_are_printed(answered: Callable[..., Any], capsys: pytest.CaptureFixture[str]):
@@ -381,10 +389,12 @@ def test_evaluating_a_run_again_gives_its_summary(trained: Trained, answered: Ca
 
 def test_the_real_mpe2_gives_the_same_within_sampling_error(trained: Trained, answered: Callable[..., Any]):
     episodes = 100
-    there = answered("evaluate", trained.folder, "--backend", "mpe2", "--episodes", episodes)
+    member = f"{trained.folder}@1"
+    there = answered("evaluate", member, "--backend", "mpe2", "--episodes", episodes)
     assert there["backend"] == "mpe2"
+    assert len(there["final"]["greedy"]["return_agent_mean"]["values"]) == 1
 
-    opened = play.open_run(trained.folder)
+    opened = play.open_run(member)
     env = envs.make(opened.config.env)
     noop, memory = scripted.make("noop", env)
     ours = {
@@ -411,17 +421,16 @@ def test_a_rendered_episode_moves_and_is_not_overwritten(
     trained: Trained, refused: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "run.gif"
-    words = ["render", str(trained.folder), "--out", str(out), "--episodes", "1", "--size", "120"]
+    words = ["render", str(trained.folder), "--out", str(out), "--size", "120"]
     assert main(words) == 0
-    assert f"{out}: 1 episode" in capsys.readouterr().out
+    assert f"{out}: 4 episodes of {trained.folder}" in capsys.readouterr().out
     shown = list(frames(out))
-    assert len(shown) == 16, "15 steps and where they started"
+    assert len(shown) == 4 * 16, "15 steps and where they started"
     assert any((frame != shown[0]).any() for frame in shown[1:])
     assert max(shown[0].shape) >= 120
 
     before = out.read_bytes()
     assert f"{out} exists" in refused(*words)
     assert out.read_bytes() == before
-    words[words.index("--episodes") + 1] = "2"
     assert main([*words, "--overwrite"]) == 0
-    assert len(list(frames(out))) == 32
+    assert len(list(frames(out))) == 4 * 16

@@ -466,6 +466,7 @@ class Updates:
     """(rows, temperature, noise) as each update hands them to the loss."""
 
 
+_, UNPACK = gacrl_paper.packing(N, 18)
 COVERAGE = (1 / 3, 2 / 3, 1 / 3)
 STORED = np.array([100.0, 101.0, 102.0])
 
@@ -480,7 +481,7 @@ def updates():
         jnp.asarray(rng.integers(0, 5, (3, N)), jnp.int32),
         jnp.asarray(STORED, jnp.float32),
     )
-    learner = learner._replace(replay=replay.Replay(stored, jnp.int32(6)))
+    learner = learner._replace(replay=replay.Replay(jax.vmap(gacrl_paper.pack)(stored), jnp.int32(6)))
 
     result = Updates([learner], [], [], [])
     original = gacrl_paper.loss
@@ -602,7 +603,7 @@ def test_environments_side_by_side_share_one_coverage(monkeypatch):
         info={"coverage_theta": jnp.array([[1 / 3, 2 / 3], [0.0, 2 / 3]])},
     )
     after, metrics = jax.jit(ALGORITHM.update)(learner, Rollout(steps, (), ()), jax.random.key(0))
-    np.testing.assert_array_equal(after.replay.items.reward, [1, 2, 3, 4, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(jax.vmap(UNPACK)(after.replay.items).reward, [1, 2, 3, 4, 0, 0, 0, 0, 0])
     assert int(after.optimizer.count) == 4
     assert metrics["loss"] == 2.5
     np.testing.assert_allclose(metrics["epsilon"], 0.3 + 0.2 * (1 + 0.5) / 2, rtol=1e-6)

@@ -120,6 +120,7 @@ def test_oracle_with_continuous_actions():
     positions, landmarks = starts(400, 3, 3)
     ends = play_on(Spread(continuous_actions=True), positions, landmarks, 25)
     assert covered(ends, landmarks) >= 0.99
+    assert np.mean([(pdist(end) < 2 * Physics().agent_radius).any() for end in ends]) <= 0.02
 
 
 def test_floors_with_continuous_actions():
@@ -136,13 +137,13 @@ def test_floors_with_continuous_actions():
 
 
 @pytest.mark.parametrize(
-    ("num_agents", "num_landmarks", "coverage"),
-    [(1, 1, 1.0), (4, 2, 0.97), (2, 4, 0.5)],
-    ids=["alone", "surplus agents keep away", "surplus landmarks"],
+    ("num_agents", "num_landmarks", "num_steps", "coverage"),
+    [(1, 1, 30, 1.0), (10, 2, 15, 0.885), (2, 4, 30, 0.5)],
+    ids=["alone", "surplus agents make way", "surplus landmarks"],
 )
-def test_any_number_of_agents_and_landmarks(num_agents, num_landmarks, coverage):
-    positions, landmarks = starts(200, num_agents, num_landmarks)
-    ends = play_on(Spread(num_agents, num_landmarks), positions, landmarks, 40)
+def test_any_number_of_agents_and_landmarks(num_agents, num_landmarks, num_steps, coverage):
+    positions, landmarks = starts(400, num_agents, num_landmarks)
+    ends = play_on(Spread(num_agents, num_landmarks), positions, landmarks, num_steps)
     assert covered(ends, landmarks) >= coverage
 
 

@@ -30,12 +30,14 @@ from gacrl.experiments import paper_tables
 from gacrl.training import checkpoint
 from gacrl.training.recorder import RunFolder
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("resume")]
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
-CHUNK, STEPS = 60, 300
+STEPS, CHUNK, LAST = 450, 60, 30
 RUN = [
-    *("--num-seeds", "2", "--seed", "5", "--evaluation.interval", str(CHUNK), "--env.max-cycles", "15"),
-    *("--evaluation.num-episodes", "2", "--evaluation.final-episodes", "3", "--algorithm.replay-capacity", "100"),
+    *("--env-steps", str(STEPS), "--evaluation.interval", str(CHUNK), "--num-seeds", "2", "--seed", "5"),
+    # The rest decides what is compiled: as in ../test_cli.py.
+    *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
+    *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", "8"),
 ]
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
@@ -56,9 +58,9 @@ def gacrl(*words: object) -> int:
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory, quick_start: dict[str, str]) -> Path:
-    """Two seeds, 300 steps each, in five chunks."""
+    """Two seeds, 450 steps each, in seven chunks and half a one."""
     folder = tmp_path_factory.mktemp("resume") / "uninterrupted"
-    assert gacrl("train", *RUN, "--env-steps", STEPS, "--out", folder) == 0
+    assert gacrl("train", *RUN, "--out", folder) == 0
     return folder
 
 
@@ -117,44 +119,18 @@ def wait_for_lines(child: subprocess.Popen[str], folder: Path, count: int) -> No
 def test_an_uninterrupted_run_is_as_planned(uninterrupted: Path):
     found = rows(uninterrupted)
     assert [(row["env_steps"], row["seed"]) for row in found] == [
-        (steps, seed) for steps in range(CHUNK, STEPS + 1, CHUNK) for seed in (5, 6)
+        (steps, seed) for steps in [*range(CHUNK, STEPS, CHUNK), STEPS] for seed in (5, 6)
     ]
     one, two = (row["train"]["mean"]["return_agent_mean"] for row in found[:2])
     assert one != two, "the seeds differ"
-    assert tensors(uninterrupted) != tensors(uninterrupted, STEPS - CHUNK)
+    assert tensors(uninterrupted) != tensors(uninterrupted, STEPS - LAST)
 
 
-def test_a_killed_run_ends_with_the_same_bits(
+def test_a_run_that_was_interrupted_and_killed_ends_with_the_same_bits(
     uninterrupted: Path, tmp_path: Path, process: Any, capsys: pytest.CaptureFixture[str]
 ):
-    folder = tmp_path / "killed"
-    child = process("train", *RUN, "--env-steps", STEPS, "--out", folder)
-    wait_for_lines(child, folder, 4)
-    # While it runs, nobody else may: not even to read a checkpoint and go on from there.
-    assert main(["resume", str(folder)]) == 2
-    assert capsys.readouterr().err == (
-        f"gacrl: {folder} is in use by another gacrl process: wait for it, or stop it\n"
-    )
-    child.send_signal(signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
-    assert not (folder / "summary.json").exists(), "killed before its end"
-
-    # What a crash in the middle of a write leaves behind.
-    with (folder / "metrics.jsonl").open("a") as file:
-        file.write('{"seed": 5, "env_ste')
-    (folder / "checkpoints/.unfinished-step-000000000240").mkdir(exist_ok=True)
-
-    assert gacrl("resume", folder) == 0
-    assert_same_end(folder, uninterrupted)
-    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [
-        "step-000000000240",
-        "step-000000000300",
-    ]
-
-
-def test_an_interrupted_run_stops_at_a_checkpoint_and_goes_on(uninterrupted: Path, tmp_path: Path, process: Any):
     folder = tmp_path / "interrupted"
-    child = process("train", *RUN, "--env-steps", STEPS, "--out", folder)
+    child = process("train", *RUN, "--out", folder)
     wait_for_lines(child, folder, 2)
     child.send_signal(signal.SIGINT)
     said = child.communicate(timeout=240)[0]
@@ -163,22 +139,39 @@ def test_an_interrupted_run_stops_at_a_checkpoint_and_goes_on(uninterrupted: Pat
     reached = rows(folder)[-1]["env_steps"]
     assert said.splitlines()[-1] == f"stopped at environment step {reached}; go on with: gacrl resume {folder}"
     assert CHUNK <= reached < STEPS
-    assert tensors(folder, reached)
+    assert tensors(folder, reached), "stopped at a checkpoint"
+
+    child = process("resume", folder)
+    wait_for_lines(child, folder, len(rows(folder)) + 2)
+    assert main(["resume", str(folder)]) == 2
+    in_use = f"gacrl: {folder} is in use by another gacrl process: wait for it, or stop it\n"
+    assert capsys.readouterr().err == in_use
+    child.send_signal(signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL
+    assert not (folder / "summary.json").exists(), "killed before its end"
+    # What a crash in the middle of a write leaves behind.
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write('{"seed": 5, "env_ste')
+    (folder / f"checkpoints/.unfinished-step-{STEPS:012d}").mkdir()
 
     assert gacrl("resume", folder) == 0
     assert_same_end(folder, uninterrupted)
+    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [
+        f"step-{STEPS - LAST:012d}",
+        f"step-{STEPS:012d}",
+    ]
 
 
 def test_an_extended_run_is_one_planned_longer(uninterrupted: Path, tmp_path: Path):
     folder = tmp_path / "extended"
     shutil.copytree(uninterrupted, folder)
     shorter = json.loads((folder / "config.json").read_text())
-    shorter["training"]["env_steps"] = STEPS - CHUNK
+    shorter["training"]["env_steps"] = STEPS - LAST
     (folder / "config.json").write_text(json.dumps(shorter))
     shutil.rmtree(folder / f"checkpoints/step-{STEPS:012d}")
     (folder / "summary.json").unlink()
 
-    assert gacrl("resume", folder, "--extend", CHUNK) == 0
+    assert gacrl("resume", folder, "--extend", LAST) == 0
     assert_same_end(folder, uninterrupted)
     assert configuration.load(folder / "config.json") == configuration.load(uninterrupted / "config.json")
 

@@ -5,6 +5,7 @@ Equation (1) is in `envs.shaping`, the encoder (2)–(3) in `networks.encoder`, 
 `networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in `exploration`.
 """
 
+from collections.abc import Callable
 from math import prod
 from typing import Any, NamedTuple
 
@@ -215,6 +216,27 @@ class Experience(NamedTuple):
     """The team's reward as it was when earned: θ and the local ratio have moved on since."""
 
 
+def pack(experience: Experience) -> Float[Array, " W"]:
+    """An experience as the one vector that the replay keeps.
+
+    Of rings with small items XLA makes whole copies where it reads what it has just written.
+    """
+    return ravel_pytree(experience)[0]
+
+
+def packing(
+    num_agents: int, observation_size: int
+) -> tuple[Float[Array, " W"], Callable[[Float[Array, " W"]], Experience]]:
+    """An empty experience as a vector, and the inverse of `pack`."""
+    blank = Experience(
+        features=jnp.zeros((num_agents, observation_size)),
+        adjacency=jnp.zeros((num_agents, num_agents), bool),
+        action=jnp.zeros(num_agents, jnp.int32),
+        reward=jnp.zeros(()),
+    )
+    return ravel_pytree(blank)
+
+
 class Hyper(NamedTuple):
     """Table I and what stands in the equations, as numbers that a sweep can vary."""
 
@@ -318,14 +340,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
         kl_weight=config.kl_weight,
     )
 
-    blank = Experience(
-        features=jnp.zeros((num_agents, observation_size)),
-        adjacency=jnp.zeros((num_agents, num_agents), bool),
-        action=jnp.zeros(num_agents, jnp.int32),
-        reward=jnp.zeros(()),
-    )
-    # One vector an item: XLA copies rings of small items whole where it reads what it has just written.
-    packed_blank, unpack = ravel_pytree(blank)
+    blank, unpack = packing(num_agents, observation_size)
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
@@ -339,7 +354,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
         return LearnerState(
             network=network,
             optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            replay=ring.empty(packed_blank, config.replay_capacity),
+            replay=ring.empty(blank, config.replay_capacity),
             coverage=no_coverage(),
             hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
         )
@@ -394,7 +409,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             step.decision.action,
             step.reward.mean(),
         )
-        replay = ring.add(learner.replay, ravel_pytree(current)[0])
+        replay = ring.add(learner.replay, pack(current))
         sampled = ring.sample_rows(replay, sample_key, config.batch_size)
         rows = jax.vmap(unpack)(ring.take(replay, jnp.append(sampled, ring.newest(replay))))
         fresh, _ = draw_noise(noise_key, num_agents, 0, config, config.batch_size)

@@ -1,0 +1,72 @@
+"""Every command and every line of Python in the README works, word for word.
+
+The `paper` preset is a small one here; nothing else is changed.
+"""
+
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+
+import gacrl
+from gacrl import cli, config
+
+ROOT = Path(__file__).parent.parent
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+COMMANDS = [
+    line.split("#")[0].strip() for language, block in BLOCKS if language == "bash" for line in block.splitlines()
+]
+PYTHON = [block for language, block in BLOCKS if language == "python"]
+
+pytestmark = pytest.mark.xdist_group("readme")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, quick_start):
+    """A folder to work in, in which the paper's schedule is short."""
+    paper = config.PRESETS["paper"][1]
+    short = replace(
+        paper,
+        env=replace(paper.env, max_cycles=5),
+        training=replace(paper.training, env_steps=500),
+        evaluation=replace(paper.evaluation, interval=250, num_episodes=4, final_episodes=8),
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "PRESETS", MappingProxyType({"paper": ("short", short)}))
+        patch.chdir(tmp_path_factory.mktemp("readme"))
+        yield
+
+
+def test_the_two_commands_are_in_the_makefile():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    made = [command.split()[1] for command in COMMANDS if command.startswith("make ")]
+    assert made[:2] == ["train", "test"]
+    assert all(re.search(rf"^{target}:", makefile, flags=re.MULTILINE) for target in made)
+
+
+def test_every_command_does_what_it_says(room, capsys):
+    commands = [shlex.split(command) for command in COMMANDS if command.startswith("gacrl ")]
+    assert {words[1] for words in commands} == set(cli._COMMANDS), "every command has its line"
+    for words in commands:
+        if ">" in words:
+            words, target = words[: words.index(">")], words[words.index(">") + 1]
+            assert cli.main(words[1:]) == 0
+            Path(target).write_text(capsys.readouterr().out, encoding="utf-8")
+        else:
+            assert cli.main(words[1:]) == 0, words
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        if words[1] in ("train", "resume"):
+            folder = re.search(r"^summary +(\S+)/summary.json$", said.out, flags=re.MULTILINE)
+            assert folder is not None and (Path(folder[1]) / "episodes.gif").is_file()
+
+
+def test_the_python_of_the_readme(room):
+    assert len(PYTHON) == 1
+    names: dict = {}
+    exec(PYTHON[0], names)
+    env = gacrl.make_env("spread")
+    assert names["policy"]([[0.0] * env.observation_size] * 3).shape == (3,)

@@ -1,0 +1,346 @@
+"""The compiled loop: one program for all chunks, members that are seeds, episodes counted right, fixed starts."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gacrl import rollout
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig, preset
+from gacrl.envs import scripted
+from gacrl.envs.spread import Spread
+from gacrl.evaluation.episodes import record_many
+from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.training import checkpoint, session
+from gacrl.training.curriculum import constant
+from gacrl.training.devices import one_seed, without_padding
+from gacrl.training.loop import train
+from gacrl.training.trainer import ChunkReport, Trainer
+from gacrl.types import Decision, Transition
+
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("trainer")]
+
+PAPER = preset("paper")
+SMALL = replace(
+    PAPER,
+    env=replace(PAPER.env, max_cycles=4),
+    algorithm=replace(PAPER.algorithm, replay_capacity=20, batch_size=8),
+    training=TrainingConfig(env_steps=25),
+    evaluation=EvaluationConfig(interval=10, num_episodes=3),
+    seed=3,
+)
+
+
+@pytest.fixture(scope="module")
+def trainers(quick_start: dict[str, str]) -> dict[int, Trainer]:
+    """Of one, two and three seeds, on the two devices that there are."""
+    assert jax.local_device_count() == 2
+    return {count: session.build(replace(SMALL, num_seeds=count)) for count in (1, 2, 3)}
+
+
+def leaves(tree: Any) -> list[np.ndarray]:
+    """As plain numbers, also random keys."""
+    return [
+        np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+        for leaf in jax.tree.leaves(tree)
+    ]
+
+
+# Compiling.
+
+
+def compiled(records: list[logging.LogRecord]) -> list[str]:
+    return [record.getMessage() for record in records if record.getMessage().startswith("Compiling ")]
+
+
+def test_a_second_chunk_compiles_nothing_whatever_its_length(
+    trainers: dict[int, Trainer], caplog: pytest.LogCaptureFixture, tmp_path: Any
+):
+    """Chunks of 10, 10 and 5 updates, each with its evaluations and its checkpoint."""
+    config, trainer, traced = replace(SMALL, num_seeds=2), trainers[2], 0
+    original = trainer.algorithm
+
+    def update(*arguments: Any) -> Any:
+        nonlocal traced
+        traced += 1
+        return original.update(*arguments)
+
+    trainer.algorithm = original._replace(update=update)
+    counts: list[int] = []
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        for progress in train(trainer, config, trainer.init(config.seeds)):
+            state = without_padding(progress.state, 2)
+            checkpoint.save(tmp_path, state, progress.env_steps, "", {})
+            assert state.updates.tolist() == [progress.env_steps] * 2
+            counts.append(len(compiled(caplog.records)))
+            if len(counts) == 1:
+                first_traces = traced
+    trainer.algorithm = original
+    assert progress.env_steps == 25
+    assert len(counts) == 3
+    assert counts[0] > 0, "compiling is seen"
+    assert compiled(caplog.records)[counts[0] :] == []
+    assert first_traces > 0
+    assert traced == first_traces
+
+
+# Seeds.
+
+
+@pytest.fixture(scope="module")
+def alone(trainers: dict[int, Trainer]) -> dict[int, list[np.ndarray]]:
+    """After ten updates: everything about the seeds 3, 4 and 5, each trained by itself."""
+    return {
+        seed: [leaf[0] for leaf in leaves(trainers[1].chunk(trainers[1].init((seed,)), 10)[0])] for seed in (3, 4, 5)
+    }
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_member_is_its_seed_alone(count: int, trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
+    """Two seeds have a device each; of three, the last is repeated, and each device maps over two."""
+    trainer = trainers[count]
+    state, report = trainer.chunk(trainer.init(replace(SMALL, num_seeds=count).seeds), 10)
+    padded = count + count % 2
+    assert {leaf.shape[0] for leaf in jax.tree.leaves((state, report))} == {padded}
+    assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.learner)} == {2}
+    together = leaves(without_padding(state, count))
+    for member in range(count):
+        for here, there in zip(together, alone[3 + member], strict=True):
+            np.testing.assert_allclose(here[member], there, atol=1e-5)
+    assert any((here[0] != here[1]).any() for here in together), "the seeds differ"
+
+
+def test_a_seed_gives_the_same_bits_again(trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
+    again = leaves(trainers[1].chunk(trainers[1].init((4,)), 10)[0])
+    for here, there in zip(again, alone[4], strict=True):
+        np.testing.assert_array_equal(here[0], there)
+
+
+def test_chunks_may_be_cut_anywhere(trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
+    state = trainers[1].init((5,))
+    for updates in (1, 7, 2):
+        state, _ = trainers[1].chunk(state, updates)
+    for here, there in zip(leaves(state), alone[5], strict=True):
+        np.testing.assert_array_equal(here[0], there)
+
+
+# Episodes.
+
+E, T, LIMIT, UPDATES = 2, 3, 4, 8
+CLOSE = Spread(2, 2, max_cycles=LIMIT, reset_on_collision="truncate")
+CLOSE = replace(CLOSE, initial_params=CLOSE.initial_params._replace(reset_distance=0.7))
+"""Episodes end after four steps, or when the agents are close: now and then, and not in step with each other."""
+
+
+def remembering(env: Spread) -> Algorithm:
+    """Acts at random, learns nothing, and keeps the last rollout's transitions in place of a learner."""
+    random, memory = scripted.make("random", env)
+
+    def blank() -> Transition:
+        params = env.default_params()
+        carry = rollout.start(env, params, memory, jax.random.key(0), E)
+        return rollout.collect(env, random, memory, params, carry, jax.random.key(0), T)[1].transitions
+
+    shapes = jax.eval_shape(blank)
+    return Algorithm(
+        init=lambda key, hyper: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
+        initial_memory=lambda num_agents: (),
+        policy=lambda learner, explore: random,
+        update=lambda learner, rollout, key: (rollout.transitions, {"loss": jnp.asarray(2.0)}),
+        hyper=(),
+    )
+
+
+@pytest.fixture(scope="module")
+def history(quick_start: dict[str, str]) -> tuple[Trainer, Transition, list[ChunkReport]]:
+    """Transitions [updates x T, E, ...] and reports of single updates, seed 1."""
+    trainer = Trainer(remembering(CLOSE), CLOSE, constant(), E, T)
+    state, transitions, reports = trainer.init((1,)), [], []
+    for _ in range(UPDATES):
+        state, report = trainer.chunk(state, 1)
+        transitions.append(jax.device_get(one_seed(state.learner, 0)))
+        reports.append(jax.device_get(one_seed(report, 0)))
+    return trainer, jax.tree.map(lambda *parts: np.concatenate(parts), *transitions), reports
+
+
+def episodes_by_hand(steps: Transition) -> list[tuple[int, dict[str, float]]]:
+    """The time of its last step, and metrics, of each episode in the order in which they ended."""
+    done, found = steps.terminated | steps.truncated, []
+    for e in range(E):
+        begin = 0
+        for t in np.flatnonzero(done[:, e]):
+            info = {name: values[begin : t + 1, e] for name, values in steps.info.items()}
+            metrics = {"return_agent_mean": info["reward_raw"].sum(), "collisions": info["collisions"].sum()}
+            for name in ("reward_raw", "reward_shaped", "near_agents"):
+                metrics[name] = info[name].mean()
+            for who in ("agent_landmark", "landmark_agent", "agent_agent"):
+                metrics[f"distance_{who}"] = info[f"distance_{who}"].mean()
+            for radius in ("0.1", "0.2", "0.5"):
+                metrics[f"coverage_mean_{radius}"] = info[f"coverage_{radius}"].mean()
+                metrics[f"coverage_final_{radius}"] = info[f"coverage_{radius}"][-1]
+            metrics["coverage_mean_theta"] = info["coverage_theta"].mean()
+            metrics["success_final_0.1"] = info["success_0.1"][-1]
+            found.append((int(t), metrics))
+            begin = t + 1
+    return sorted(found, key=lambda episode: episode[0])
+
+
+def test_episodes_are_counted_as_by_hand(history: tuple[Trainer, Transition, list[ChunkReport]]):
+    trainer, steps, reports = history
+    episodes = episodes_by_hand(steps)
+    lengths = {int(t) for t, _ in episodes}
+    assert len(episodes) > UPDATES * T * E / LIMIT, "some ended before the time limit"
+    assert len(lengths) > UPDATES * T / LIMIT, "not in step with each other"
+    for update, report in enumerate(reports):
+        ended = [metrics for t, metrics in episodes if update * T <= t < (update + 1) * T]
+        assert report.episodes.ended == len(ended)
+        assert report.metrics == {"loss": 2.0}
+        for k, name in enumerate(trainer.metric_names):
+            values = np.array([metrics[name] for metrics in ended])
+            np.testing.assert_allclose(report.episodes.total[k], values.sum(), rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(report.episodes.squares[k], np.square(values).sum(), rtol=1e-5, atol=1e-6)
+            if len(values):
+                np.testing.assert_allclose(report.episodes.last[k], values[-1], rtol=1e-5, atol=1e-6)
+    assert set(trainer.metric_names) == set(episodes[0][1])
+
+
+def test_a_long_chunk_counts_what_short_ones_do(history: tuple[Trainer, Transition, list[ChunkReport]]):
+    trainer, steps, reports = history
+    state, report = jax.device_get(trainer.chunk(trainer.init((1,)), UPDATES))
+    assert report.episodes.ended[0] == state.episodes[0] == len(episodes_by_hand(steps))
+    for part in ("total", "squares"):
+        parts = [getattr(report.episodes, part) for report in reports]
+        np.testing.assert_allclose(getattr(report.episodes, part)[0], np.sum(parts, axis=0), rtol=1e-5, atol=1e-6)
+    newest = next(report for report in reversed(reports) if report.episodes.ended)
+    np.testing.assert_array_equal(report.episodes.last[0], newest.episodes.last)
+    assert report.metrics["loss"] == [2.0], "a mean over the updates"
+
+
+def test_what_follows_an_end_is_a_reset_and_what_is_learned_from_is_not(
+    history: tuple[Trainer, Transition, list[ChunkReport]],
+):
+    _, steps, _ = history
+    done = steps.terminated | steps.truncated
+    assert not steps.terminated.any(), "this task ends by its time limit alone"
+    assert steps.first[0].all()
+    np.testing.assert_array_equal(steps.first[1:], done[:-1])
+
+    state, after = steps.observation.state, steps.next_observation.state
+    np.testing.assert_array_equal(after[:-1][~done[:-1]], state[1:][~done[:-1]])
+    velocities = state.reshape(*state.shape[:2], -1)[..., 4:8]
+    assert (velocities[steps.first] == 0).all(), "at rest after a reset"
+
+    # The observation after a last step is the world that the step led to, and no reset.
+    places, _ = np.split(steps.observation.positions, 1), None
+    moved = steps.next_observation.positions - places[0]
+    assert np.abs(moved).max() < 0.2, "nobody jumps within a step"
+    jumped = steps.observation.positions[1:] - steps.next_observation.positions[:-1]
+    assert (np.abs(jumped[done[:-1]]).reshape(done[:-1].sum(), -1).max(1) > 0.2).all(), "a reset moves everyone"
+    params = CLOSE.default_params()
+    step = jax.jit(CLOSE.step)
+    for t, e in np.argwhere(done)[:6]:
+        before = jax.tree.map(lambda leaf, t=t, e=e: jnp.asarray(leaf[t, e]), steps)
+        world, _ = CLOSE.reset(jax.random.key(0), params)
+        packed = before.observation.state
+        world = world._replace(
+            positions=packed[:4].reshape(2, 2),
+            velocities=packed[4:8].reshape(2, 2),
+            landmarks=packed[8:12].reshape(2, 2),
+        )
+        _, by_hand = step(world, before.decision.action, jax.random.key(0), params)
+        np.testing.assert_allclose(before.next_observation.features, by_hand.observation.features, atol=1e-6)
+
+
+# Evaluation.
+
+
+def test_evaluation_does_not_depend_on_what_was_trained_before(trainers: dict[int, Trainer]):
+    trainer = trainers[2]
+    state = trainer.init((3, 4))
+    learner = jax.tree.map(jnp.copy, state.learner)
+
+    def measured() -> dict[str, np.ndarray]:
+        return jax.device_get(trainer.evaluate(learner, True, "monitor", 3))
+
+    before = measured()
+    trained, _ = trainer.chunk(state, 10)
+    jax.block_until_ready(trainer.evaluate(trained.learner, True, "monitor", 3))
+    after = measured()
+    for name, values in before.items():
+        np.testing.assert_array_equal(values, after[name])
+    assert before["return_agent_mean"].shape == (2, 3)
+
+
+def starts(policy: Any, memory: Any, env: Spread) -> np.ndarray:
+    """Where everything stands at the beginning of three evaluation episodes."""
+    episodes = record_many(env, policy, memory, env.default_params(), stream_key("monitor"), 3)
+    return np.stack([np.concatenate([episode.positions[0], episode.landmarks[0]]) for episode in episodes])
+
+
+def test_every_policy_is_evaluated_from_the_same_starts(trainers: dict[int, Trainer]):
+    trainer = trainers[2]
+    env = session.evaluation_env(SMALL)
+    learner = trainer.init((3, 4)).learner
+    expected = starts(*scripted.make("noop", env), env)
+    np.testing.assert_array_equal(starts(*scripted.make("random", env), env), expected)
+    for member in (0, 1):
+        for explore in (False, True):
+            policy = trainer.algorithm.policy(one_seed(learner, member), explore)
+            np.testing.assert_array_equal(starts(policy, trainer.memory, env), expected)
+
+    # What the recordings show is what is measured.
+    noop, memory = scripted.make("noop", env)
+    episodes = record_many(env, noop, memory, env.default_params(), stream_key("monitor"), 3)
+    measured = jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("monitor"), 3))()
+    np.testing.assert_allclose(
+        measured["return_agent_mean"], [episode.return_so_far[-1] for episode in episodes], rtol=1e-5
+    )
+
+
+def test_streams_of_random_numbers_never_meet():
+    keys = [stream_key("training", seed) for seed in (*range(200), 20_260_101, 2**31 - 1, 2**32 - 1)]
+    keys += [stream_key(stream) for stream in ("monitor", "gate", "report")]
+    assert len(np.unique([jax.random.key_data(key) for key in keys], axis=0)) == len(keys)
+
+    env = Spread()
+    draw: Callable[..., Any] = jax.jit(jax.vmap(lambda key: env.reset(key)[0].positions))
+    places = np.concatenate([np.asarray(draw(jax.random.split(key, 8))) for key in keys])
+    assert len(np.unique(places.reshape(len(places), -1), axis=0)) == 8 * len(keys)
+
+
+def test_seeds_beyond_the_first_get_their_own_training_stream(trainers: dict[int, Trainer]):
+    state = trainers[3].init((3, 4, 5))
+    keys = jax.random.key_data(without_padding(state, 3).key)
+    assert len(np.unique(keys, axis=0)) == 3
+    positions = np.asarray(without_padding(state, 3).carry.env_state.positions)
+    assert len(np.unique(positions.reshape(3, -1), axis=0)) == 3
+
+
+def test_a_run_that_diverges_says_so():
+    """A loss that is not a number ends the run at once, before a checkpoint of it is written."""
+    from gacrl.errors import UserError
+
+    algorithm = remembering(CLOSE)._replace(
+        update=lambda learner, rollout, key: (rollout.transitions, {"loss": jnp.asarray(jnp.nan)})
+    )
+    config = RunConfig(
+        env=replace(PAPER.env, num_agents=2, max_cycles=LIMIT),
+        training=TrainingConfig(env_steps=E * T, num_envs=E, num_steps=T),
+        evaluation=EvaluationConfig(num_episodes=1),
+    )
+    trainer = Trainer(algorithm, CLOSE, constant(), E, T)
+    with pytest.raises(UserError, match=r"seed 0 diverged: loss is nan by environment step 6; .*smaller learning"):
+        next(train(trainer, config, trainer.init((0,))))
+
+
+def test_decisions_say_what_was_done(history: tuple[Trainer, Transition, list[ChunkReport]]):
+    _, steps, _ = history
+    assert isinstance(steps.decision, Decision)
+    assert steps.decision.action.shape == (UPDATES * T, E, 2)
+    assert set(np.unique(steps.decision.action)) == set(range(5))
