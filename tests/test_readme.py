@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
 import pytest
 
 import gacrl
@@ -69,4 +70,5 @@ def test_the_python_of_the_readme(room):
     names: dict = {}
     exec(PYTHON[0], names)
     env = gacrl.make_env("spread")
-    assert names["policy"]([[0.0] * env.observation_size] * 3).shape == (3,)
+    observations = np.zeros((3, env.observation_size), np.float32)
+    assert names["policy"](observations).shape == (3,)
