@@ -87,7 +87,10 @@ def test_every_layer_stands_on_files():
         ("from gacrl.envs import spread\nimport gacrl.config", []),
         ("import gacrl.training.loop", ["line 1: rollout imports training"]),
         ("def f():\n    from gacrl import play as p", ["line 2: rollout imports play"]),
-        ("if TYPE_CHECKING:\n    from gacrl import cli\nelse:\n    import gacrl.api", ["line 4: rollout imports api"]),
+        (
+            "if TYPE_CHECKING:\n    from gacrl import cli\nelse:\n    import gacrl.api",
+            ["line 4: rollout imports api"],
+        ),
         ("import jax\nfrom gacrlother import cli", []),
     ],
 )

@@ -125,7 +125,11 @@ def flip_a_byte(path: Path) -> None:
         ("config --preset papre", "unknown preset 'papre'", "did you mean 'paper'?"),
         ("train --preset", "--preset needs a value", "gacrl train --help"),
         ("train --config --json", "--config needs a value", "gacrl train --help"),
-        ("train --algorithm.learnig-rate 1", "--algorithm.learnig-rate", "did you mean --algorithm.learning-rate?"),
+        (
+            "train --algorithm.learnig-rate 1",
+            "--algorithm.learnig-rate",
+            "did you mean --algorithm.learning-rate?",
+        ),
         ("train --num-sedes 2", "--num-sedes", "did you mean --num-seeds?"),
         ("evaluate random --episodse 2", "--episodse", "did you mean --episodes?"),
         ("presets --nonsense", "--nonsense", "gacrl presets --help"),
@@ -399,7 +403,9 @@ def test_the_real_mpe2_gives_the_same_within_sampling_error(trained: Trained, an
     noop, memory = scripted.make("noop", env)
     ours = {
         "greedy": opened.trainer.evaluate(opened.learners, False, "report", episodes),
-        "noop": jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("report"), episodes))(),
+        "noop": jax.jit(
+            lambda: evaluate(env, noop, memory, env.default_params(), stream_key("report"), episodes)
+        )(),
     }
     for who, metrics in ours.items():
         for name in ("return_agent_mean", "distance_landmark_agent", "coverage_mean_0.5", "reward_shaped"):

@@ -51,6 +51,7 @@ def test_the_two_commands_are_in_the_makefile():
 def test_every_command_does_what_it_says(room, capsys):
     commands = [shlex.split(command) for command in COMMANDS if command.startswith("gacrl ")]
     assert {words[1] for words in commands} == set(cli._COMMANDS), "every command has its line"
+    commands.remove(["gacrl", "doctor"])  # a minute long: below
     for words in commands:
         if ">" in words:
             words, target = words[: words.index(">")], words[words.index(">") + 1]
@@ -63,6 +64,12 @@ def test_every_command_does_what_it_says(room, capsys):
         if words[1] in ("train", "resume"):
             folder = re.search(r"^summary +(\S+)/summary.json$", said.out, flags=re.MULTILINE)
             assert folder is not None and (Path(folder[1]) / "episodes.gif").is_file()
+
+
+@pytest.mark.soak
+def test_the_doctor_finds_this_machine_healthy(capsys):
+    assert cli.main(["doctor"]) == 0
+    assert "BAD" not in capsys.readouterr().out
 
 
 def test_the_python_of_the_readme(room):

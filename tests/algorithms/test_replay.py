@@ -20,9 +20,7 @@ def item(number):
 
 
 add = jax.jit(replay.add)
-sample = jax.jit(
-    lambda ring, key, size: replay.take(ring, replay.sample_rows(ring, key, size)), static_argnums=2
-)
+sample = jax.jit(lambda ring, key, size: replay.take(ring, replay.sample_rows(ring, key, size)), static_argnums=2)
 
 
 def filled(count, capacity=4):

@@ -277,7 +277,9 @@ def test_no_damage_goes_unseen(tmp_path: Path):
         assert checkpoint.newest(tmp_path)[0].folder == newer
 
 
-@pytest.mark.parametrize("content", ["", "[]", "3", "null", "{}", '{"format_version": 1}', '{"format_version": 2}'])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "3", "null", "{}", '{"format_version": 1}', '{"format_version": 2}']
+)
 def test_what_is_no_manifest_is_damage(content: str, tmp_path: Path):
     (saved(tmp_path) / "manifest.json").write_text(content)
     with pytest.raises(UserError, match=f"every checkpoint in {tmp_path} is damaged: train the run again"):

@@ -97,7 +97,8 @@ def test_a_second_chunk_compiles_nothing_whatever_its_length(
 def alone(trainers: dict[int, Trainer]) -> dict[int, list[np.ndarray]]:
     """After ten updates: everything about the seeds 3, 4 and 5, each trained by itself."""
     return {
-        seed: [leaf[0] for leaf in leaves(trainers[1].chunk(trainers[1].init((seed,)), 10)[0])] for seed in (3, 4, 5)
+        seed: [leaf[0] for leaf in leaves(trainers[1].chunk(trainers[1].init((seed,)), 10)[0])]
+        for seed in (3, 4, 5)
     }
 
 
