@@ -131,8 +131,8 @@ def main() -> None:
         middle = statistics.median(values)
         print(f"{middle:.1f} times as fast as {name} ({min(values):.1f} to {max(values):.1f})")
     print(
-        f"arithmetic: {flops_per_step() / 1e6:.1f} MFLOP a step, {statistics.median(shares):.0%} of its time at the "
-        f"{ours['gflops']:.0f} GFLOP/s of a 512 × 512 matrix product on this core"
+        f"arithmetic: {flops_per_step() / 1e6:.1f} MFLOP a step, {statistics.median(shares):.0%} of its time "
+        f"at the {ours['gflops']:.0f} GFLOP/s of a 512 × 512 matrix product on this core"
     )
     if arguments.json:
         summary = {name: {"N=3": statistics.median(values)} for name, values in ratios.items()}
