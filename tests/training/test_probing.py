@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 
 from gacrl.config import GacrlPaperConfig
-from gacrl.envs.probes import BEST_RETURN
+from gacrl.doctor import BEYOND
+from gacrl.envs.probes import BEST_RETURN, PROBES
 from gacrl.training.probing import ProbeResult, probe_algorithm
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("probing")]
-
-UPDATES, SEED = 4_000, 2
+pytestmark = pytest.mark.xdist_group("probing")  # all but the soak shares one compiled program
 
 
 @pytest.fixture(scope="module")
-def printed(quick_start: dict[str, str]) -> ProbeResult:
-    return probe_algorithm(GacrlPaperConfig(), UPDATES, seed=SEED)
+def printed() -> ProbeResult:
+    """Half of what `gacrl doctor` gives it; a third was enough for each of six seeds."""
+    return probe_algorithm(GacrlPaperConfig(), 1_500)
 
 
 @pytest.mark.parametrize("probe", ["action", "both"])
@@ -31,18 +31,23 @@ def test_the_critic_regresses_the_immediate_reward(printed: ProbeResult):
     assert printed.values["discount"] == pytest.approx((0.0, 0.0), abs=0.05)
 
 
-def test_the_printed_kl_weight_silences_the_messages(printed: ProbeResult):
-    """Messages are made from the latent alone. Before anybody listens, nothing but the KL term acts on it, and with
-    the printed weight it forgets the observation for good; without the term the same seed learns to talk.
-    """
+def test_what_cannot_be_acted_on_brings_what_chance_does(printed: ProbeResult):
+    """The sign of the 32 starts is what it is, and `message` is beyond this algorithm: see the soak below."""
+    assert set(printed.returns) == set(PROBES)
+    assert printed.returns["value"] == 1.0
+    assert abs(printed.returns["observation"]) < 0.5
+    assert BEYOND["gacrl_paper"] == ("message",)
     assert abs(printed.returns["message"]) < 0.5
-    talking = probe_algorithm(replace(GacrlPaperConfig(), kl_weight=0.0), UPDATES, seed=SEED)
+
+
+@pytest.mark.soak
+def test_the_printed_kl_weight_silences_the_messages():
+    """Messages are made from the latent alone, and while nobody listens nothing but the KL term acts on it: with the
+    printed weight it forgets the observation. Without the term, the same seed learns to talk.
+
+    Of six seeds none solved `message` within 10,000 updates as printed, and all of them did at weight 0.
+    """
+    config, updates, seed = GacrlPaperConfig(), 4_000, 2
+    assert abs(probe_algorithm(config, updates, seed=seed).returns["message"]) < 0.5
+    talking = probe_algorithm(replace(config, kl_weight=0.0), updates, seed=seed)
     assert talking.returns["message"] == BEST_RETURN["message"] == 1.0
-
-
-def test_acting_at_random_brings_nothing(quick_start: dict[str, str]):
-    """After a single update the policy is still that of its initial weights: greedy, and no better than chance."""
-    untrained = probe_algorithm(GacrlPaperConfig(), 1, seed=SEED)
-    assert abs(untrained.returns["both"]) < 0.5
-    assert abs(untrained.returns["message"]) < 0.5
-    assert abs(untrained.values["value"][0] - 1.0) > 0.5
