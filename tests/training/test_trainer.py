@@ -15,6 +15,7 @@ from gacrl.algorithms.algorithm import Algorithm
 from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig, preset
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
+from gacrl.errors import UserError
 from gacrl.evaluation.episodes import record_many
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training import checkpoint, session
@@ -24,17 +25,18 @@ from gacrl.training.loop import train
 from gacrl.training.trainer import ChunkReport, Trainer
 from gacrl.types import Decision, Transition
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("trainer")]
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
 PAPER = preset("paper")
 SMALL = replace(
     PAPER,
-    env=replace(PAPER.env, max_cycles=4),
-    algorithm=replace(PAPER.algorithm, replay_capacity=20, batch_size=8),
+    env=replace(PAPER.env, max_cycles=15),
+    algorithm=replace(PAPER.algorithm, replay_capacity=500),
     training=TrainingConfig(env_steps=25),
-    evaluation=EvaluationConfig(interval=10, num_episodes=3),
+    evaluation=EvaluationConfig(interval=10, num_episodes=4),
     seed=3,
 )
+"""What decides the compiled programs is as in the tiny run, so that some are compiled already."""
 
 
 @pytest.fixture(scope="module")
@@ -267,20 +269,20 @@ def test_evaluation_does_not_depend_on_what_was_trained_before(trainers: dict[in
     learner = jax.tree.map(jnp.copy, state.learner)
 
     def measured() -> dict[str, np.ndarray]:
-        return jax.device_get(trainer.evaluate(learner, True, "monitor", 3))
+        return jax.device_get(trainer.evaluate(learner, True, "monitor", 4))
 
     before = measured()
     trained, _ = trainer.chunk(state, 10)
-    jax.block_until_ready(trainer.evaluate(trained.learner, True, "monitor", 3))
+    jax.block_until_ready(trainer.evaluate(trained.learner, True, "monitor", 4))
     after = measured()
     for name, values in before.items():
         np.testing.assert_array_equal(values, after[name])
-    assert before["return_agent_mean"].shape == (2, 3)
+    assert before["return_agent_mean"].shape == (2, 4)
 
 
 def starts(policy: Any, memory: Any, env: Spread) -> np.ndarray:
-    """Where everything stands at the beginning of three evaluation episodes."""
-    episodes = record_many(env, policy, memory, env.default_params(), stream_key("monitor"), 3)
+    """Where everything stands at the beginning of four evaluation episodes."""
+    episodes = record_many(env, policy, memory, env.default_params(), stream_key("monitor"), 4)
     return np.stack([np.concatenate([episode.positions[0], episode.landmarks[0]]) for episode in episodes])
 
 
@@ -290,15 +292,13 @@ def test_every_policy_is_evaluated_from_the_same_starts(trainers: dict[int, Trai
     learner = trainer.init((3, 4)).learner
     expected = starts(*scripted.make("noop", env), env)
     np.testing.assert_array_equal(starts(*scripted.make("random", env), env), expected)
-    for member in (0, 1):
-        for explore in (False, True):
-            policy = trainer.algorithm.policy(one_seed(learner, member), explore)
-            np.testing.assert_array_equal(starts(policy, trainer.memory, env), expected)
+    policy = trainer.algorithm.policy(one_seed(learner, 1), True)
+    np.testing.assert_array_equal(starts(policy, trainer.memory, env), expected)
 
     # What the recordings show is what is measured.
     noop, memory = scripted.make("noop", env)
-    episodes = record_many(env, noop, memory, env.default_params(), stream_key("monitor"), 3)
-    measured = jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("monitor"), 3))()
+    episodes = record_many(env, noop, memory, env.default_params(), stream_key("monitor"), 4)
+    measured = jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("monitor"), 4))()
     np.testing.assert_allclose(
         measured["return_agent_mean"], [episode.return_so_far[-1] for episode in episodes], rtol=1e-5
     )
@@ -323,10 +323,8 @@ def test_seeds_beyond_the_first_get_their_own_training_stream(trainers: dict[int
     assert len(np.unique(positions.reshape(3, -1), axis=0)) == 3
 
 
-def test_a_run_that_diverges_says_so():
+def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
     """A loss that is not a number ends the run at once, before a checkpoint of it is written."""
-    from gacrl.errors import UserError
-
     algorithm = remembering(CLOSE)._replace(
         update=lambda learner, rollout, key: (rollout.transitions, {"loss": jnp.asarray(jnp.nan)})
     )
@@ -336,6 +334,7 @@ def test_a_run_that_diverges_says_so():
         evaluation=EvaluationConfig(num_episodes=1),
     )
     trainer = Trainer(algorithm, CLOSE, constant(), E, T)
+    monkeypatch.setattr(trainer, "evaluate", lambda *how: {"return_agent_mean": np.zeros((1, 1))})
     with pytest.raises(UserError, match=r"seed 0 diverged: loss is nan by environment step 6; .*smaller learning"):
         next(train(trainer, config, trainer.init((0,))))
 

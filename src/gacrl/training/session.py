@@ -4,6 +4,7 @@ import platform
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -204,15 +205,24 @@ def _finish(
 
 def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, float]]:
     """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
+    return {
+        name: {
+            metric: float(np.mean(values))
+            for metric, values in _scripted_program(name, env, num_episodes)(
+                env.default_params(), stream_key("report")
+            ).items()
+        }
+        for name in scripted.SCRIPTED
+    }
 
-    def mean_metrics(name: str) -> dict[str, float]:
-        actor = scripted.make(name, env)
-        metrics = jax.jit(
-            lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
-        )(env.default_params(), stream_key("report"))
-        return {metric: float(np.mean(values)) for metric, values in metrics.items()}
 
-    return {name: mean_metrics(name) for name in scripted.SCRIPTED}
+@cache
+def _scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[..., dict[str, jax.Array]]:
+    """A scripted policy's evaluation, traced once a process."""
+    actor = scripted.make(name, env)
+    return jax.jit(
+        lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
+    )
 
 
 def versions() -> dict[str, str]:
