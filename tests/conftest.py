@@ -1,7 +1,11 @@
 """Strictness for every test: two fake devices, no silent rank promotion, shapes checked at run time."""
 
+import contextlib
+import io
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -15,21 +19,19 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("gacrl", "beartype.beartype")
 
 
-@pytest.fixture(scope="module")
-def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """For modules that start whole runs: programs compile with little optimisation, and only once.
+@contextlib.contextmanager
+def compiled_quickly(factory: pytest.TempPathFactory) -> Generator[dict[str, str]]:
+    """Programs compile with little optimisation, and only once for all the tests of a worker.
 
-    They are shared by all tests, workers and processes of a session. Gives the environment that lets a
-    subprocess share them, too.
+    Gives the environment that lets a subprocess share them. Workers do not: JAX writes an unbounded cache without
+    a lock, and reads what is half written.
     """
-    root = tmp_path_factory.getbasetemp()
-    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
     settings = {
-        "jax_compilation_cache_dir": str(root / "compiled"),
-        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        "jax_compilation_cache_dir": str(factory.getbasetemp() / "compiled"),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_disable_most_optimizations": True,
     }
-    before = {name: getattr(jax.config, name, False) for name in settings}
+    before = {name: jax.config.values[name] for name in settings}
     for name, value in settings.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
@@ -37,3 +39,45 @@ def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """For modules that start whole runs, or whose programs are small."""
+    with compiled_quickly(tmp_path_factory) as environment:
+        yield environment
+
+
+class TinyRun(NamedTuple):
+    folder: Path
+    words: list[str]
+    """The flags that it was trained with, but for --out."""
+    said: str
+    """What was printed."""
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    """A run to look at, and to copy before anything is changed: two seeds, 450 steps, a checkpoint every 60.
+
+    Tests that use it belong into the xdist group `runs`, so that it is trained once.
+    """
+    import numpy as np
+
+    from gacrl.cli import main
+    from gacrl.experiments import paper_tables
+
+    folder = tmp_path_factory.mktemp("tiny") / "run"
+    words = [
+        *("--env-steps", "450", "--evaluation.interval", "60", "--num-seeds", "2", "--seed", "5"),
+        *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", "8"),
+        *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
+    ]
+    # The scripted policies' rows in the paper's tables would take longer to compile than all the rest.
+    measured = {"reward_shaped": np.array([12.25, 12.75]), "coverage_mean_theta": np.array([0.25, 0.75])}
+    said = io.StringIO()
+    with compiled_quickly(tmp_path_factory), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_tables, "_play_scripted", lambda *task: measured)
+        with contextlib.redirect_stdout(said):
+            assert main(["train", *words, "--out", str(folder), "--json"]) == 0
+    return TinyRun(folder, words, said.getvalue())

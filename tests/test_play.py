@@ -22,7 +22,7 @@ from gacrl.types import Channel
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
-N, V, O = 3, 8, 18
+N, V, SEEN = 3, 8, 18
 
 
 def untrained(config: RunConfig, path: Path) -> Path:
@@ -52,7 +52,7 @@ def policy(run: Path) -> gacrl.LoadedPolicy:
 @pytest.fixture(scope="module")
 def observations() -> np.ndarray:
     """As from MPE2: in single precision or double, [K, N, O]."""
-    return np.random.default_rng(0).normal(size=(40, N, O))
+    return np.random.default_rng(0).normal(size=(40, N, SEEN))
 
 
 def test_it_acts_as_the_trained_policy_does(
@@ -101,11 +101,9 @@ def episode_greedy(policy: gacrl.LoadedPolicy, seen: np.ndarray) -> np.ndarray:
     return policy(seen)
 
 
-@pytest.mark.parametrize("shape", [(N, O - 1), (N + 1, O), (1, N, O), (N * O,), ()])
-def test_observations_of_another_shape_are_refused(shape: tuple[int, ...], policy: gacrl.LoadedPolicy):
-    with pytest.raises(
-        ValueError, match=rf"must be \[agents, numbers\] = \({N}, {O}\), not \({shape[0] if shape else ''}"
-    ):
+@pytest.mark.parametrize("shape", [(N, SEEN - 1), (N + 1, SEEN), (SEEN, N)])
+def test_observations_of_another_shape_are_refused(shape: tuple[int, int], policy: gacrl.LoadedPolicy):
+    with pytest.raises(ValueError, match=rf"= \({N}, {SEEN}\), not \({shape[0]}, {shape[1]}\)"):
         policy(np.zeros(shape))
 
 
@@ -145,7 +143,7 @@ def test_it_drives_the_real_mpe2(policy: gacrl.LoadedPolicy):
 
 
 def test_scripted_policies_can_be_held_too():
-    observations = np.zeros((N, O))
+    observations = np.zeros((N, SEEN))
     np.testing.assert_array_equal(gacrl.load_policy("noop")(observations), [0, 0, 0])
     random = gacrl.load_policy("random")
     drawn = np.stack([random(observations, greedy=False) for _ in range(40)])
@@ -165,9 +163,9 @@ def test_what_is_no_run_is_refused(tmp_path: Path):
 def test_an_environment_is_made_by_its_settings():
     env = gacrl.make_env("spread", num_agents=5, num_landmark_neighbors=2)
     assert (env.num_agents, env.num_landmarks, env.observation_size) == (5, 5, 4 + 2 * 2 + 4 * 4)
-    state, seen = env.reset(jax.random.key(0))
+    state, seen = jax.eval_shape(env.reset, jax.random.key(0))
     assert seen.features.shape == (5, env.observation_size)
-    _, after = env.step(state, jnp.zeros(5, jnp.int32), jax.random.key(0))
+    _, after = jax.eval_shape(env.step, state, jnp.zeros(5, jnp.int32), jax.random.key(0))
     assert after.reward.shape == (5,)
     with pytest.raises(
         gacrl.ConfigError, match=r"unknown setting 'env.num_agent': did you mean 'env.num_agents'?"

@@ -1,7 +1,6 @@
 """Interrupted runs end with the same bits as runs that never were; checkpoints know when they are damaged.
 
-All of it runs in one process, with runs of two seeds; with xdist, on one worker. Only runs that get signals
-have a process of their own.
+With xdist all of it runs on one worker, that of the tiny run, which has two seeds.
 """
 
 import contextlib
@@ -22,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+from conftest import TinyRun
 
 from gacrl import config as configuration
 from gacrl.cli import main
@@ -33,12 +33,7 @@ from gacrl.training.recorder import RunFolder
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
 STEPS, CHUNK, LAST = 450, 60, 30
-RUN = [
-    *("--env-steps", str(STEPS), "--evaluation.interval", str(CHUNK), "--num-seeds", "2", "--seed", "5"),
-    # The rest decides what is compiled: as in ../test_cli.py.
-    *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
-    *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", "8"),
-]
+"""The tiny run's."""
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 
@@ -56,12 +51,10 @@ def gacrl(*words: object) -> int:
         return main([str(word) for word in words])
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory, quick_start: dict[str, str]) -> Path:
+@pytest.fixture
+def uninterrupted(tiny_run: TinyRun) -> Path:
     """Two seeds, 450 steps each, in seven chunks and half a one."""
-    folder = tmp_path_factory.mktemp("resume") / "uninterrupted"
-    assert gacrl("train", *RUN, "--out", folder) == 0
-    return folder
+    return tiny_run.folder
 
 
 @pytest.fixture
@@ -127,25 +120,40 @@ def test_an_uninterrupted_run_is_as_planned(uninterrupted: Path):
 
 
 def test_a_run_that_was_interrupted_and_killed_ends_with_the_same_bits(
-    uninterrupted: Path, tmp_path: Path, process: Any, capsys: pytest.CaptureFixture[str]
+    tiny_run: TinyRun,
+    tmp_path: Path,
+    process: Any,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    folder = tmp_path / "interrupted"
-    child = process("train", *RUN, "--out", folder)
-    wait_for_lines(child, folder, 2)
-    child.send_signal(signal.SIGINT)
-    said = child.communicate(timeout=240)[0]
-    assert child.returncode == 130
-    assert "Traceback" not in said
-    reached = rows(folder)[-1]["env_steps"]
-    assert said.splitlines()[-1] == f"stopped at environment step {reached}; go on with: gacrl resume {folder}"
-    assert CHUNK <= reached < STEPS
-    assert tensors(folder, reached), "stopped at a checkpoint"
+    folder, uninterrupted = tmp_path / "interrupted", tiny_run.folder
 
+    # Ctrl-C during the second chunk.
+    real = RunFolder.append_metrics
+
+    def interrupted(self: RunFolder, rows: list[dict[str, Any]]) -> None:
+        if rows[0]["env_steps"] == 2 * CHUNK:
+            signal.raise_signal(signal.SIGINT)
+        real(self, rows)
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "append_metrics", interrupted)
+        assert main(["train", *tiny_run.words, "--out", str(folder)]) == 130
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    said = capfd.readouterr()
+    assert said.err == ""
+    assert said.out.splitlines()[-1] == f"stopped at environment step 120; go on with: gacrl resume {folder}"
+    assert rows(folder) == rows(uninterrupted)[:4]
+    assert checkpoint.newest(folder / "checkpoints")[0].env_steps == 120
+    assert not (folder / "summary.json").exists()
+
+    # kill -9 during the fourth or a later one; meanwhile nobody else may go on with the run.
     child = process("resume", folder)
-    wait_for_lines(child, folder, len(rows(folder)) + 2)
+    wait_for_lines(child, folder, 6)
     assert main(["resume", str(folder)]) == 2
     in_use = f"gacrl: {folder} is in use by another gacrl process: wait for it, or stop it\n"
-    assert capsys.readouterr().err == in_use
+    assert capfd.readouterr().err == in_use
     child.send_signal(signal.SIGKILL)
     assert child.wait() == -signal.SIGKILL
     assert not (folder / "summary.json").exists(), "killed before its end"

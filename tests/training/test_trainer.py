@@ -3,17 +3,20 @@
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
 from gacrl import rollout
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig, preset
 from gacrl.envs import scripted
+from gacrl.envs.environment import Environment
+from gacrl.envs.probes import Probe
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
 from gacrl.evaluation.episodes import record_many
@@ -23,7 +26,7 @@ from gacrl.training.curriculum import constant
 from gacrl.training.devices import one_seed, without_padding
 from gacrl.training.loop import train
 from gacrl.training.trainer import ChunkReport, Trainer
-from gacrl.types import Decision, Transition
+from gacrl.types import Decision, Metrics, Policy, Transition
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -41,9 +44,9 @@ SMALL = replace(
 
 @pytest.fixture(scope="module")
 def trainers(quick_start: dict[str, str]) -> dict[int, Trainer]:
-    """Of one, two and three seeds, on the two devices that there are."""
+    """The paper's algorithm for one and for two seeds, on the two devices that there are."""
     assert jax.local_device_count() == 2
-    return {count: session.build(replace(SMALL, num_seeds=count)) for count in (1, 2, 3)}
+    return {count: session.build(replace(SMALL, num_seeds=count)) for count in (1, 2)}
 
 
 def leaves(tree: Any) -> list[np.ndarray]:
@@ -95,42 +98,43 @@ def test_a_second_chunk_compiles_nothing_whatever_its_length(
 # Seeds.
 
 
-@pytest.fixture(scope="module")
-def alone(trainers: dict[int, Trainer]) -> dict[int, list[np.ndarray]]:
-    """After ten updates: everything about the seeds 3, 4 and 5, each trained by itself."""
-    return {
-        seed: [leaf[0] for leaf in leaves(trainers[1].chunk(trainers[1].init((seed,)), 10)[0])]
-        for seed in (3, 4, 5)
-    }
+def alone(trainer: Trainer, seed: int) -> list[np.ndarray]:
+    """Everything about a seed after ten updates by itself."""
+    return [leaf[0] for leaf in leaves(trainer.chunk(trainer.init((seed,)), 10)[0])]
 
 
-@pytest.mark.parametrize("count", [2, 3])
-def test_a_member_is_its_seed_alone(count: int, trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
-    """Two seeds have a device each; of three, the last is repeated, and each device maps over two."""
-    trainer = trainers[count]
-    state, report = trainer.chunk(trainer.init(replace(SMALL, num_seeds=count).seeds), 10)
-    padded = count + count % 2
+def assert_members_are_seeds(single: Trainer, several: Trainer, seeds: tuple[int, ...]) -> None:
+    state, report = several.chunk(several.init(seeds), 10)
+    padded = len(seeds) + len(seeds) % 2
     assert {leaf.shape[0] for leaf in jax.tree.leaves((state, report))} == {padded}
     assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.learner)} == {2}
-    together = leaves(without_padding(state, count))
-    for member in range(count):
-        for here, there in zip(together, alone[3 + member], strict=True):
+    together = leaves(without_padding(state, len(seeds)))
+    for member, seed in enumerate(seeds):
+        for here, there in zip(together, alone(single, seed), strict=True):
             np.testing.assert_allclose(here[member], there, atol=1e-5)
     assert any((here[0] != here[1]).any() for here in together), "the seeds differ"
 
 
-def test_a_seed_gives_the_same_bits_again(trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
-    again = leaves(trainers[1].chunk(trainers[1].init((4,)), 10)[0])
-    for here, there in zip(again, alone[4], strict=True):
-        np.testing.assert_array_equal(here[0], there)
+def test_two_members_are_their_seeds_alone(trainers: dict[int, Trainer]):
+    """The paper's algorithm, each seed on a device of its own."""
+    assert_members_are_seeds(trainers[1], trainers[2], (3, 4))
 
 
-def test_chunks_may_be_cut_anywhere(trainers: dict[int, Trainer], alone: dict[int, list[np.ndarray]]):
-    state = trainers[1].init((5,))
+def test_three_members_are_their_seeds_alone(quick_start: dict[str, str]):
+    """Each device maps over two seeds; of the last one there are two copies, one of which is never looked at."""
+    env = Probe("both")
+    single, several = (Trainer(remembering(env), env, constant(), E, T, num_seeds=count) for count in (1, 3))
+    assert_members_are_seeds(single, several, (3, 4, 5))
+
+
+def test_a_seed_gives_the_same_bits_again_and_chunks_may_be_cut_anywhere(trainers: dict[int, Trainer]):
+    whole, again = alone(trainers[1], 3), alone(trainers[1], 3)
+    state = trainers[1].init((3,))
     for updates in (1, 7, 2):
         state, _ = trainers[1].chunk(state, updates)
-    for here, there in zip(leaves(state), alone[5], strict=True):
-        np.testing.assert_array_equal(here[0], there)
+    for first, second, cut in zip(whole, again, leaves(state), strict=True):
+        np.testing.assert_array_equal(first, second)
+        np.testing.assert_array_equal(first, cut[0])
 
 
 # Episodes.
@@ -141,35 +145,60 @@ CLOSE = replace(CLOSE, initial_params=CLOSE.initial_params._replace(reset_distan
 """Episodes end after four steps, or when the agents are close: now and then, and not in step with each other."""
 
 
-def remembering(env: Spread) -> Algorithm:
-    """Acts at random, learns nothing, and keeps the last rollout's transitions in place of a learner."""
-    random, memory = scripted.make("random", env)
+class Remembered(NamedTuple):
+    weights: Array
+    transitions: Transition
+    """Of the last rollout."""
 
-    def blank() -> Transition:
-        params = env.default_params()
-        carry = rollout.start(env, params, memory, jax.random.key(0), E)
-        return rollout.collect(env, random, memory, params, carry, jax.random.key(0), T)[1].transitions
 
-    shapes = jax.eval_shape(blank)
-    return Algorithm(
-        init=lambda key, hyper: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
-        initial_memory=lambda num_agents: (),
-        policy=lambda learner, explore: random,
-        update=lambda learner, rollout, key: (rollout.transitions, {"loss": jnp.asarray(2.0)}),
-        hyper=(),
-    )
+def remembering(env: Environment) -> Algorithm:
+    """A linear policy that follows a made-up gradient, and remembers what it saw."""
+
+    def policy(learner: Remembered, explore: bool) -> Policy:
+        def act(memory: Any, observation: Any, key: Any, channel: Any) -> tuple[Decision, Any]:
+            return Decision(jax.random.categorical(key, observation.features @ learner.weights)), memory
+
+        return act
+
+    def blank(weights: Array) -> Transition:
+        params, key = env.default_params(), jax.random.key(0)
+        carry = rollout.start(env, params, (), key, E)
+        act = policy(Remembered(weights, ()), True)
+        return rollout.collect(env, act, (), params, carry, key, T)[1].transitions
+
+    def init(key: Any, hyper: Any) -> Remembered:
+        weights = jax.random.normal(key, (env.observation_size, env.num_actions))
+        shapes = jax.eval_shape(blank, weights)
+        return Remembered(weights, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+
+    def update(learner: Remembered, rollout: Any, key: Any) -> tuple[Remembered, Metrics]:
+        steps = rollout.transitions
+        direction = jnp.einsum("teno,ten->o", steps.observation.features, steps.reward)
+        noise = jax.random.normal(key, learner.weights.shape)
+        weights = learner.weights + 1e-3 * (direction[:, None] * jnp.ones((1, env.num_actions)) + noise)
+        return Remembered(weights, steps), {"loss": jnp.asarray(2.0)}
+
+    return Algorithm(init, lambda num_agents: (), policy, update, hyper=())
+
+
+class History(NamedTuple):
+    trainer: Trainer
+    steps: Transition
+    """[updates x T, E, ...]"""
+    reports: list[ChunkReport]
+    """Of single updates."""
 
 
 @pytest.fixture(scope="module")
-def history(quick_start: dict[str, str]) -> tuple[Trainer, Transition, list[ChunkReport]]:
-    """Transitions [updates x T, E, ...] and reports of single updates, seed 1."""
+def history(quick_start: dict[str, str]) -> History:
+    """Seed 1."""
     trainer = Trainer(remembering(CLOSE), CLOSE, constant(), E, T)
     state, transitions, reports = trainer.init((1,)), [], []
     for _ in range(UPDATES):
         state, report = trainer.chunk(state, 1)
-        transitions.append(jax.device_get(one_seed(state.learner, 0)))
+        transitions.append(jax.device_get(one_seed(state.learner.transitions, 0)))
         reports.append(jax.device_get(one_seed(report, 0)))
-    return trainer, jax.tree.map(lambda *parts: np.concatenate(parts), *transitions), reports
+    return History(trainer, jax.tree.map(lambda *parts: np.concatenate(parts), *transitions), reports)
 
 
 def episodes_by_hand(steps: Transition) -> list[tuple[int, dict[str, float]]]:
@@ -194,7 +223,7 @@ def episodes_by_hand(steps: Transition) -> list[tuple[int, dict[str, float]]]:
     return sorted(found, key=lambda episode: episode[0])
 
 
-def test_episodes_are_counted_as_by_hand(history: tuple[Trainer, Transition, list[ChunkReport]]):
+def test_episodes_are_counted_as_by_hand(history: History):
     trainer, steps, reports = history
     episodes = episodes_by_hand(steps)
     lengths = {int(t) for t, _ in episodes}
@@ -213,7 +242,7 @@ def test_episodes_are_counted_as_by_hand(history: tuple[Trainer, Transition, lis
     assert set(trainer.metric_names) == set(episodes[0][1])
 
 
-def test_a_long_chunk_counts_what_short_ones_do(history: tuple[Trainer, Transition, list[ChunkReport]]):
+def test_a_long_chunk_counts_what_short_ones_do(history: History):
     trainer, steps, reports = history
     state, report = jax.device_get(trainer.chunk(trainer.init((1,)), UPDATES))
     assert report.episodes.ended[0] == state.episodes[0] == len(episodes_by_hand(steps))
@@ -226,7 +255,7 @@ def test_a_long_chunk_counts_what_short_ones_do(history: tuple[Trainer, Transiti
 
 
 def test_what_follows_an_end_is_a_reset_and_what_is_learned_from_is_not(
-    history: tuple[Trainer, Transition, list[ChunkReport]],
+    history: History,
 ):
     _, steps, _ = history
     done = steps.terminated | steps.truncated
@@ -280,28 +309,23 @@ def test_evaluation_does_not_depend_on_what_was_trained_before(trainers: dict[in
     assert before["return_agent_mean"].shape == (2, 4)
 
 
-def starts(policy: Any, memory: Any, env: Spread) -> np.ndarray:
-    """Where everything stands at the beginning of four evaluation episodes."""
-    episodes = record_many(env, policy, memory, env.default_params(), stream_key("monitor"), 4)
-    return np.stack([np.concatenate([episode.positions[0], episode.landmarks[0]]) for episode in episodes])
-
-
 def test_every_policy_is_evaluated_from_the_same_starts(trainers: dict[int, Trainer]):
     trainer = trainers[2]
-    env = session.evaluation_env(SMALL)
-    learner = trainer.init((3, 4)).learner
-    expected = starts(*scripted.make("noop", env), env)
-    np.testing.assert_array_equal(starts(*scripted.make("random", env), env), expected)
-    policy = trainer.algorithm.policy(one_seed(learner, 1), True)
-    np.testing.assert_array_equal(starts(policy, trainer.memory, env), expected)
+    env, key = session.evaluation_env(SMALL), stream_key("monitor")
+    params = env.default_params()
+    noop, nothing = scripted.make("noop", env)
+    learner = one_seed(trainer.init((3, 4)).learner, 1)
+    played = record_many(env, trainer.algorithm.policy(learner, True), trainer.memory, params, key, 4)
+    idle = record_many(env, noop, nothing, params, key, 4)
+    for one, other in zip(played, idle, strict=True):
+        np.testing.assert_array_equal(one.positions[0], other.positions[0])
+        np.testing.assert_array_equal(one.landmarks[0], other.landmarks[0])
+        assert (one.positions[-1] != other.positions[-1]).any()
+    assert len({episode.positions[0].tobytes() for episode in idle}) == 4
 
     # What the recordings show is what is measured.
-    noop, memory = scripted.make("noop", env)
-    episodes = record_many(env, noop, memory, env.default_params(), stream_key("monitor"), 4)
-    measured = jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), stream_key("monitor"), 4))()
-    np.testing.assert_allclose(
-        measured["return_agent_mean"], [episode.return_so_far[-1] for episode in episodes], rtol=1e-5
-    )
+    measured = jax.jit(lambda: evaluate(env, noop, nothing, params, key, 4))()["return_agent_mean"]
+    np.testing.assert_allclose(measured, [episode.return_so_far[-1] for episode in idle], rtol=1e-5)
 
 
 def test_streams_of_random_numbers_never_meet():
@@ -315,19 +339,18 @@ def test_streams_of_random_numbers_never_meet():
     assert len(np.unique(places.reshape(len(places), -1), axis=0)) == 8 * len(keys)
 
 
-def test_seeds_beyond_the_first_get_their_own_training_stream(trainers: dict[int, Trainer]):
-    state = trainers[3].init((3, 4, 5))
-    keys = jax.random.key_data(without_padding(state, 3).key)
+def test_every_seed_has_a_training_stream_of_its_own(history: History):
+    state = history.trainer.init_stacked((3, 4, 5))
+    keys = jax.random.key_data(state.key)
     assert len(np.unique(keys, axis=0)) == 3
-    positions = np.asarray(without_padding(state, 3).carry.env_state.positions)
-    assert len(np.unique(positions.reshape(3, -1), axis=0)) == 3
+    positions = np.asarray(state.carry.env_state.positions)
+    assert len(np.unique(positions.reshape(3 * E, -1), axis=0)) == 3 * E
 
 
 def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
     """A loss that is not a number ends the run at once, before a checkpoint of it is written."""
-    algorithm = remembering(CLOSE)._replace(
-        update=lambda learner, rollout, key: (rollout.transitions, {"loss": jnp.asarray(jnp.nan)})
-    )
+    algorithm = remembering(CLOSE)
+    algorithm = algorithm._replace(update=lambda learner, rollout, key: (learner, {"loss": jnp.asarray(jnp.nan)}))
     config = RunConfig(
         env=replace(PAPER.env, num_agents=2, max_cycles=LIMIT),
         training=TrainingConfig(env_steps=E * T, num_envs=E, num_steps=T),
@@ -339,7 +362,7 @@ def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
         next(train(trainer, config, trainer.init((0,))))
 
 
-def test_decisions_say_what_was_done(history: tuple[Trainer, Transition, list[ChunkReport]]):
+def test_transitions_hold_what_was_done(history: History):
     _, steps, _ = history
     assert isinstance(steps.decision, Decision)
     assert steps.decision.action.shape == (UPDATES * T, E, 2)
