@@ -174,10 +174,180 @@ class GacrlPaperConfig:
             )
 
 
-AlgorithmConfig: TypeAlias = GacrlPaperConfig
-"""Any algorithm's settings; a union as soon as there are two."""
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The agents' network: torso, memory and communication, the same choices for every algorithm."""
 
-ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType({GacrlPaperConfig.name: GacrlPaperConfig})
+    torso: Literal["mlp", "graph"] = "mlp"
+    """Layers over the observation vector, or a graph of the entities in sight by relative position."""
+    width: int = 128
+    """Units of a hidden layer."""
+    depth: int = 2
+    """Hidden layers of the mlp torso."""
+    recurrent: bool = False
+    """A GRU after the torso."""
+    communication: Literal["none", "commnet", "dial", "discrete", "soft"] = "none"
+    """CommNet's averages, DIAL's regularised units, or Gumbel-Softmax symbols: hard or soft."""
+    rounds: int = 1
+    """Rounds of messages within a step (CommNet, symbols)."""
+    vocabulary: int = 8
+    """Symbols of a message; units of a DIAL message."""
+    dial_noise: float = 2.0
+    """Standard deviation of the noise on DIAL's units while learning."""
+    radius: float = 1.5
+    """Agents nearer than this hear each other, where the task has positions."""
+    nearest_landmarks: int | None = None
+    """The graph torso looks at this many nearest landmarks; none: all in sight."""
+    nearest_agents: int | None = None
+    """And at this many nearest other agents."""
+    parameters: int | None = None
+    """Choose the width so that the acting network has about this many parameters; none: take the width."""
+
+    def __post_init__(self) -> None:
+        _between(
+            "algorithm.network", self, 1, 65_536, "width", "vocabulary", "nearest_landmarks", "nearest_agents"
+        )
+        _between("algorithm.network", self, 1, 100, "depth", "rounds")
+        _between("algorithm.network", self, 0.0, 100.0, "dial_noise")
+        _between("algorithm.network", self, 0.0, 1e6, "radius")
+        _between("algorithm.network", self, 1, 1_000_000_000, "parameters")
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """What every learner has: its network, its horizon, its step size, and the symmetry of the task."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    learning_rate: float = 1e-3
+    """Adam's step size at the start."""
+    learning_rate_end: float = 0.0
+    """And after the planned environment steps; linear in between."""
+    gamma: float = 0.95
+    """Discount of a step."""
+    n_step: int = 1
+    """Rewards in a target before it bootstraps (PPO: 0 leaves it to gae_lambda)."""
+    max_grad_norm: float = 10.0
+    """Longer gradients are shortened to this norm."""
+    augment: bool = False
+    """Turn what is learned from by a random one of the task's symmetries."""
+    reward: Literal["team", "own"] = "team"
+    """Every agent earns the team's mean reward, or its own."""
+
+    def __post_init__(self) -> None:
+        _between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "gamma")
+        _between("algorithm", self, 0, 1_000, "n_step")
+        _between("algorithm", self, 1e-6, 1e6, "max_grad_norm")
+
+
+@dataclass(frozen=True)
+class PpoConfig(LearningConfig):
+    """Proximal policy optimisation of a team with shared weights; MAPPO and IPPO differ by the critic's view."""
+
+    n_step: int = 0
+    """Rewards in a target before it bootstraps; 0 leaves it to gae_lambda."""
+    gae_lambda: float = 0.95
+    """Of generalised advantage estimation."""
+    update_epochs: int = 6
+    """Passes over a rollout."""
+    num_minibatches: int = 2
+    """Gradient steps of a pass; a minibatch takes environments and times, never single agents."""
+    clip_eps: float = 0.2
+    """Bound of the policy's ratio around 1."""
+    ent_coef: float = 0.01
+    """Weight of the policy's entropy."""
+    ent_coef_end: float = 0.0
+    """And after the planned environment steps."""
+    vf_coef: float = 0.5
+    """Weight of the critic's loss."""
+    huber_delta: float = 10.0
+    """The critic's loss is linear beyond this error, in standard deviations of the returns."""
+    value_norm: bool = True
+    """The critic predicts returns in units of their running mean and standard deviation."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _between("algorithm", self, 0.0, 1.0, "gae_lambda")
+        _between("algorithm", self, 1, 10_000, "update_epochs", "num_minibatches")
+        _between("algorithm", self, 1e-6, 1e6, "clip_eps", "huber_delta")
+        _between("algorithm", self, 0.0, 1e6, "ent_coef", "ent_coef_end", "vf_coef")
+
+
+@dataclass(frozen=True)
+class MappoConfig(PpoConfig):
+    """MAPPO (Yu et al. 2022): the critic sees the global state besides the agent's observation."""
+
+    name: ClassVar[str] = "mappo"
+
+
+@dataclass(frozen=True)
+class IppoConfig(PpoConfig):
+    """IPPO (de Witt et al. 2020): the critic sees what its agent sees."""
+
+    name: ClassVar[str] = "ippo"
+
+
+@dataclass(frozen=True)
+class QLearningConfig(LearningConfig):
+    """Q-learning of a team from replay."""
+
+    replay_capacity: int = 50_000
+    """Environment steps that the replay remembers."""
+    learning_starts: int = 1_000
+    """Environment steps before the first gradient step."""
+    batch_size: int = 128
+    """Windows of replayed steps in a gradient step."""
+    sequence_length: int = 1
+    """Steps learned from in a window; a recurrent network is unrolled over them."""
+    updates: int = 2
+    """Gradient steps after each rollout."""
+    target_step: float = 0.01
+    """The target network moves this far towards the online one after each gradient step."""
+    reward_norm: bool = False
+    """Learn from rewards in units of their running mean and standard deviation, which keeps values around 0 (a
+    monotonic mixer's units saturate far below it). Leaves the optimum where episodes have a fixed length."""
+    double_q: bool = True
+    """The online network chooses the action that the target network values."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.n_step >= 1, "algorithm.n_step must be at least 1 where there is no gae_lambda")
+        _between(
+            "algorithm", self, 1, 10_000_000, "replay_capacity", "batch_size", "sequence_length", "mixer_width"
+        )
+        _between("algorithm", self, 0, 1_000_000_000, "learning_starts")
+        _between("algorithm", self, 1, 1_000_000, "updates")
+        _between("algorithm", self, 0.0, 1.0, "target_step")
+
+
+@dataclass(frozen=True)
+class QmixConfig(QLearningConfig):
+    """QMIX, and with other mixers VDN and IQL."""
+
+    name: ClassVar[str] = "qmix"
+
+    mixer: Literal["qmix", "vdn", "iql"] = "qmix"
+    """A monotonic network of the agents' values, their sum, or each for itself."""
+    mixer_width: int = 32
+    """Units of QMIX's mixing network."""
+    epsilon: float = 1.0
+    """Share of random actions at the start."""
+    epsilon_end: float = 0.05
+    epsilon_steps: int = 50_000
+    """Environment steps over which the share falls."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _between("algorithm", self, 1, 10_000, "mixer_width")
+        _between("algorithm", self, 0, 1_000_000_000, "epsilon_steps")
+        _between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end")
+
+
+AlgorithmConfig: TypeAlias = GacrlPaperConfig | MappoConfig | IppoConfig | QmixConfig
+"""Any algorithm's settings."""
+
+ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType(
+    {kind.name: kind for kind in (GacrlPaperConfig, MappoConfig, IppoConfig, QmixConfig)}
+)
 
 
 @dataclass(frozen=True)
@@ -235,8 +405,8 @@ class RunConfig:
         _between("run", self, 0, 2**31 - 1, "seed")
         _between("run", self, 1, 10_000, "num_seeds")
         _require(
-            not (self.env.continuous_actions and self.algorithm.name == GacrlPaperConfig.name),
-            "the paper's GACRL needs discrete actions: leave env.continuous_actions at False",
+            not self.env.continuous_actions,
+            f"{self.algorithm.name} needs discrete actions: leave env.continuous_actions at False",
         )
 
     @property
@@ -268,8 +438,47 @@ _PAPER = RunConfig(
     preset="paper",
 )
 
+
+def _baseline(name: str, algorithm: AlgorithmConfig, training: TrainingConfig) -> RunConfig:
+    """A baseline on the standard task: MPE2's reward, 25 steps."""
+    return RunConfig(
+        algorithm=algorithm,
+        training=training,
+        evaluation=EvaluationConfig(interval=max(training.env_steps // 20, 1)),
+        preset=name,
+    )
+
+
+_ON_POLICY = TrainingConfig(env_steps=3_000_000, num_envs=128, num_steps=25)
+_OFF_POLICY = TrainingConfig(env_steps=2_000_000, num_envs=32, num_steps=8)
+_MAPPO = _baseline("mappo", MappoConfig(learning_rate=2e-3, network=NetworkConfig(width=64)), _ON_POLICY)
+_IPPO = _baseline("ippo", IppoConfig(learning_rate=2e-3, network=NetworkConfig(width=64)), _ON_POLICY)
+_QMIX = _baseline("qmix", QmixConfig(n_step=3), _OFF_POLICY)
+_VDN = _baseline("vdn", QmixConfig(n_step=3, mixer="vdn"), _OFF_POLICY)
+_IQL = _baseline("iql", QmixConfig(n_step=3, mixer="iql"), _OFF_POLICY)
+_COMMNET = _baseline(
+    "commnet", IppoConfig(learning_rate=2e-3, network=NetworkConfig(communication="commnet", rounds=2)), _ON_POLICY
+)
+_DIAL = _baseline(
+    "dial",
+    QmixConfig(
+        n_step=3,
+        mixer="vdn",
+        sequence_length=8,
+        network=NetworkConfig(communication="dial", recurrent=True, width=64),
+    ),
+    _OFF_POLICY,
+)
+
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
+        "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
+        "vdn": ("VDN: the same learner, values summed", _VDN),
+        "iql": ("IQL: the same learner, each agent for itself", _IQL),
+        "mappo": ("MAPPO: PPO with a central critic", _MAPPO),
+        "ippo": ("IPPO: PPO with a critic for each agent", _IPPO),
+        "commnet": ("CommNet: PPO whose agents average each other's hidden states", _COMMNET),
+        "dial": ("DIAL: Q-learning through messages that are bits when played", _DIAL),
         "paper": ("the paper's GACRL as printed: 1,500 episodes of 75 steps, an update every step", _PAPER),
     }
 )

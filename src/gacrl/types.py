@@ -36,6 +36,17 @@ class Observation(NamedTuple):
     """The global state for central critics; None means the agents' features side by side."""
 
 
+class Entities(NamedTuple):
+    """What an agent sees, taken apart into the things it sees: for networks over graphs of entities."""
+
+    own: Float[Array, "*b N K"]
+    """About the agent itself, nothing that depends on where the origin lies."""
+    landmarks: Float[Array, "*b N L 2"]
+    """From the agent to each landmark in sight; (0, 0) is padding."""
+    agents: Float[Array, "*b N M 2"]
+    """From the agent to each other agent in sight; (0, 0) is padding."""
+
+
 class Decision(NamedTuple):
     """What the agents of one environment do, and how they came to it."""
 

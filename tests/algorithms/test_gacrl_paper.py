@@ -466,7 +466,7 @@ class Updates:
     """(rows, temperature, noise) as each update hands them to the loss."""
 
 
-_, UNPACK = gacrl_paper.packing(N, 18)
+_, UNPACK = replay.packing(gacrl_paper.no_experience(N, 18))
 COVERAGE = (1 / 3, 2 / 3, 1 / 3)
 STORED = np.array([100.0, 101.0, 102.0])
 
@@ -481,7 +481,7 @@ def updates():
         jnp.asarray(rng.integers(0, 5, (3, N)), jnp.int32),
         jnp.asarray(STORED, jnp.float32),
     )
-    learner = learner._replace(replay=replay.Replay(jax.vmap(gacrl_paper.pack)(stored), jnp.int32(6)))
+    learner = learner._replace(replay=replay.Replay(jax.vmap(replay.pack)(stored), jnp.int32(6)))
 
     result = Updates([learner], [], [], [])
     original = gacrl_paper.loss

@@ -3,7 +3,14 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from gacrl.config import AlgorithmConfig, GacrlPaperConfig
+from gacrl.config import (
+    AlgorithmConfig,
+    GacrlPaperConfig,
+    IppoConfig,
+    MappoConfig,
+    QmixConfig,
+    TrainingConfig,
+)
 from gacrl.envs.environment import Environment
 from gacrl.types import Learner, Memory, Metrics, Policy, PRNGKey, Rollout
 
@@ -26,11 +33,17 @@ class Algorithm(NamedTuple):
     """The configured numbers, to hand to `init` as they are or varied."""
 
 
-def make(config: AlgorithmConfig, env: Environment) -> Algorithm:
-    """Build the algorithm that the configuration names, for the shapes of this task."""
-    from gacrl.algorithms import gacrl_paper
+def make(config: AlgorithmConfig, env: Environment, training: TrainingConfig) -> Algorithm:
+    """Build the algorithm that the configuration names, for the shapes of this task.
 
-    builders: dict[type[AlgorithmConfig], Callable[[Any, Environment], Algorithm]] = {
+    training: its planned length is what schedules run over; how experience is gathered shapes a replay.
+    """
+    from gacrl.algorithms import gacrl_paper, ippo, mappo, qmix
+
+    builders: dict[type[AlgorithmConfig], Callable[[Any, Environment, TrainingConfig], Algorithm]] = {
         GacrlPaperConfig: gacrl_paper.make,
+        MappoConfig: mappo.make,
+        IppoConfig: ippo.make,
+        QmixConfig: qmix.make,
     }
-    return builders[type(config)](config, env)
+    return builders[type(config)](config, env, training)

@@ -1,9 +1,12 @@
-"""Exploration that adapts to coverage: equations (13) to (16) of the paper."""
+"""How much agents explore: linearly less, or by coverage, as equations (13) to (16) of the paper."""
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.types import PRNGKey, Transition
 
 CoverageSignal = Literal["episode_so_far", "last_episode"]
 
@@ -25,6 +28,13 @@ def linear_decay(
 ) -> Float[Array, ""]:
     """Equations (15) and (16): max(end, start − episode × (start − end) / num_episodes), for start ≥ end."""
     return jnp.maximum(end, start - episode * ((start - end) / num_episodes))
+
+
+def progress_between(
+    start: Float[Array, ""] | float, end: Float[Array, ""] | float, fraction: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Linear from start to end while the fraction goes from 0 to 1; the end after it."""
+    return start + jnp.clip(fraction, 0.0, 1.0) * (end - start)
 
 
 def adaptive_level(
@@ -71,4 +81,42 @@ def follow_coverage(past: Coverage, coverage: Float[Array, " E"], done: Bool[Arr
         steps=jnp.where(over, 0, steps),
         last_episode=jnp.where(over, total / steps, past.last_episode),
         episode=past.episode + done.sum(),
+    )
+
+
+class Level(NamedTuple):
+    """How much to explore now."""
+
+    epsilon: Float[Array, ""]
+    """Share of random actions."""
+    temperature: Float[Array, ""]
+    """Of the Gumbel-Softmax messages."""
+
+
+class Exploration(NamedTuple):
+    """An exploration rule of a learner from replay, as pure functions."""
+
+    init: Callable[[], Any]
+    level: Callable[[Any, Int[Array, ""]], Level]
+    """(state, env_steps) -> level."""
+    follow: Callable[[Any, Transition], Any]
+    """(state, the steps of a rollout [T, E, …]) -> state."""
+    initial_memory: Any
+    """What an episode carries before its first step; () where episodes are all alike."""
+    begin: Callable[[Any, PRNGKey, Float[Array, ""]], tuple[Any, Float[Array, ""]]]
+    """(what the episode carries, key, ε) -> (the same, settled; the ε of this episode)."""
+
+
+def linear(start: float, end: float, steps: int, temperature: float = 1.0) -> Exploration:
+    """ε falls linearly over the environment steps, whatever happens; one temperature."""
+
+    def level(state: Any, env_steps: Int[Array, ""]) -> Level:
+        return Level(progress_between(start, end, env_steps / max(steps, 1)), jnp.asarray(temperature))
+
+    return Exploration(
+        init=lambda: (),
+        level=level,
+        follow=lambda state, steps: state,
+        initial_memory=(),
+        begin=lambda mode, key, epsilon: (mode, epsilon),
     )

@@ -5,7 +5,6 @@ Equation (1) is in `envs.shaping`, the encoder (2)–(3) in `networks.encoder`, 
 `networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in `exploration`.
 """
 
-from collections.abc import Callable
 from math import prod
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl.algorithms import replay as ring
@@ -26,7 +24,7 @@ from gacrl.algorithms.exploration import (
     linear_decay,
     no_coverage,
 )
-from gacrl.config import GacrlPaperConfig
+from gacrl.config import GacrlPaperConfig, TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
 from gacrl.networks.graph import neighbour_sum, observed_adjacency
@@ -216,25 +214,14 @@ class Experience(NamedTuple):
     """The team's reward as it was when earned: θ and the local ratio have moved on since."""
 
 
-def pack(experience: Experience) -> Float[Array, " W"]:
-    """An experience as the one vector that the replay keeps.
-
-    Of rings with small items XLA makes whole copies where it reads what it has just written.
-    """
-    return ravel_pytree(experience)[0]
-
-
-def packing(
-    num_agents: int, observation_size: int
-) -> tuple[Float[Array, " W"], Callable[[Float[Array, " W"]], Experience]]:
-    """An empty experience as a vector, and the inverse of `pack`."""
-    blank = Experience(
+def no_experience(num_agents: int, observation_size: int) -> Experience:
+    """The shapes of an experience."""
+    return Experience(
         features=jnp.zeros((num_agents, observation_size)),
         adjacency=jnp.zeros((num_agents, num_agents), bool),
         action=jnp.zeros(num_agents, jnp.int32),
         reward=jnp.zeros(()),
     )
-    return ravel_pytree(blank)
 
 
 class Hyper(NamedTuple):
@@ -324,8 +311,11 @@ def loss(
     return total, parts
 
 
-def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
-    """The paper's algorithm for this task's shapes. Needs discrete actions and a team without padding."""
+def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | None = None) -> Algorithm:
+    """The paper's algorithm for this task's shapes. Needs discrete actions and a team without padding.
+
+    training: not looked at; the paper's schedules count episodes.
+    """
     num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
     straight_through = config.messages == "straight_through"
     adam = optax.flatten(optax.scale_by_adam())  # one vector: a kernel for each of 28 arrays costs more
@@ -340,7 +330,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
         kl_weight=config.kl_weight,
     )
 
-    blank, unpack = packing(num_agents, observation_size)
+    blank, unpack = ring.packing(no_experience(num_agents, observation_size))
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
@@ -409,7 +399,7 @@ def make(config: GacrlPaperConfig, env: Environment) -> Algorithm:
             step.decision.action,
             step.reward.mean(),
         )
-        replay = ring.add(learner.replay, pack(current))
+        replay = ring.add(learner.replay, ring.pack(current))
         sampled = ring.sample_rows(replay, sample_key, config.batch_size)
         rows = jax.vmap(unpack)(ring.take(replay, jnp.append(sampled, ring.newest(replay))))
         fresh, _ = draw_noise(noise_key, num_agents, 0, config, config.batch_size)

@@ -1,11 +1,13 @@
-"""A ring of past experience: fixed size, any pytree, uniform sampling."""
+"""A ring of past experience: fixed size, any pytree, uniform sampling of single items or of windows in time."""
 
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
 
 from gacrl.types import PRNGKey
 
@@ -39,11 +41,17 @@ def empty(example: Item, capacity: int) -> Replay[Item]:
 
 def add(replay: Replay[Item], item: Item) -> Replay[Item]:
     """Put one item in place of the oldest."""
+    return add_block(replay, jax.tree.map(lambda leaf: leaf[None], item))
+
+
+def add_block(replay: Replay[Item], block: Item) -> Replay[Item]:
+    """Put T items [T, …] in place of the oldest; the capacity must be a multiple of T."""
+    length = jax.tree.leaves(block)[0].shape[0]
     slot = replay.added % replay.capacity
     items = jax.tree.map(
-        lambda ring, leaf: jax.lax.dynamic_update_index_in_dim(ring, leaf, slot, 0), replay.items, item
+        lambda ring, leaf: jax.lax.dynamic_update_slice_in_dim(ring, leaf, slot, 0), replay.items, block
     )
-    return Replay(items, replay.added + 1)
+    return Replay(items, replay.added + length)
 
 
 def newest(replay: Replay[Item]) -> Int[Array, ""]:
@@ -60,6 +68,27 @@ def sample_rows(replay: Replay[Item], key: PRNGKey, batch_size: int) -> Int[Arra
     return (bits % replay.size.astype(jnp.uint32)).astype(jnp.int32)
 
 
+def sample_windows(replay: Replay[Item], key: PRNGKey, batch_size: int, length: int) -> Int[Array, "W B"]:
+    """Rows of uniform stretches of `length` items that were added one after the other; oldest first."""
+    starts = jnp.maximum(replay.size - length + 1, 1).astype(jnp.uint32)
+    first = (jax.random.bits(key, (batch_size,), jnp.uint32) % starts).astype(jnp.int32)
+    oldest = jnp.where(replay.added > replay.capacity, replay.added % replay.capacity, 0)
+    return (oldest + first[None, :] + jnp.arange(length)[:, None]) % replay.capacity
+
+
 def take(replay: Replay[Item], rows: Int[Array, " B"]) -> Item:
     """The items in these rows."""
     return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), replay.items)
+
+
+def pack(item: object) -> Float[Array, " W"]:
+    """An item as one vector of numbers.
+
+    Of rings with small items XLA makes whole copies where it reads what it has just written.
+    """
+    return ravel_pytree(item)[0]
+
+
+def packing(example: Item) -> tuple[Float[Array, " W"], Callable[[Float[Array, " W"]], Item]]:
+    """An empty item as a vector, and the inverse of `pack`."""
+    return ravel_pytree(jax.tree.map(jnp.zeros_like, example))

@@ -2,9 +2,9 @@
 
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.types import Metrics, Observation, PRNGKey
+from gacrl.types import Entities, Metrics, Observation, PRNGKey
 
 EnvState: TypeAlias = Any
 EnvParams: TypeAlias = Any
@@ -53,3 +53,28 @@ class Environment(Protocol):
     def step(
         self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams | None = None
     ) -> tuple[EnvState, TimeStep]: ...
+
+
+@runtime_checkable
+class SpatialEnvironment(Environment, Protocol):
+    """A task in the plane: what graph networks and symmetry augmentation need besides."""
+
+    @property
+    def own_size(self) -> int:
+        """K of `Entities.own`."""
+        ...
+
+    @property
+    def num_symmetries(self) -> int:
+        """Rotations and reflections under which the task is the same; 0 is the identity."""
+        ...
+
+    def entities(self, observation: Observation) -> Entities: ...
+
+    def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
+        """The observation of the turned world."""
+        ...
+
+    def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
+        """The action that does in the turned world what this one does here."""
+        ...

@@ -21,7 +21,8 @@ from gacrl.envs.particles import (
     pairwise_offsets,
 )
 from gacrl.envs.shaping import CollisionTerm, paper_shaped_reward
-from gacrl.types import Metrics, Observation, PRNGKey
+from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
+from gacrl.types import Entities, Metrics, Observation, PRNGKey
 
 CAPTURE_RADIUS = 0.1
 """MPE2's radius of a covered landmark."""
@@ -212,6 +213,37 @@ class Spread:
             landmark_mask=jnp.ones(self.num_landmarks, bool),
             action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
         )
+
+    @property
+    def own_size(self) -> int:
+        """Of `entities`: an agent's velocity."""
+        return 2
+
+    def entities(self, observation: Observation) -> Entities:
+        """What the features say, thing by thing, without where the origin lies."""
+        features, landmarks_end = observation.features, 4 + 2 * self.seen_landmarks
+        agents_end = landmarks_end + 2 * self.seen_agents
+        return Entities(
+            own=features[:, :2],
+            landmarks=features[:, 4:landmarks_end].reshape(self.num_agents, -1, 2),
+            agents=features[:, landmarks_end:agents_end].reshape(self.num_agents, -1, 2),
+        )
+
+    @property
+    def num_symmetries(self) -> int:
+        return NUM_SYMMETRIES
+
+    def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
+        """The observation of the turned world: all that it holds are vectors in the plane."""
+        return observation._replace(
+            features=turn_vectors(observation.features, symmetry),
+            positions=None if observation.positions is None else turn_vectors(observation.positions, symmetry),
+            state=None if observation.state is None else turn_vectors(observation.state, symmetry),
+        )
+
+    def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
+        """The action that does in the turned world what this one does here."""
+        return turn_action(action, symmetry, self.continuous_actions)
 
     def measure(self, state: SpreadState, params: SpreadParams) -> Metrics:
         """The measurements of one step; `gacrl.evaluation.metrics` turns them into an episode's.

@@ -1,4 +1,4 @@
-"""The affine layer, laid out as papers write it: W x + b."""
+"""The affine layer, laid out as papers write it: W x + b; and small stacks of it."""
 
 from typing import Literal
 
@@ -20,10 +20,17 @@ class Linear(eqx.Module):
     weight: Float[Array, "out in"]
     bias: Float[Array, " out"]
 
-    def __init__(self, in_size: int, out_size: int, key: PRNGKey):
-        """Weights and biases uniform in ±1/√in_size (the default of torch.nn.Linear)."""
-        limit = in_size**-0.5
+    def __init__(self, in_size: int, out_size: int, key: PRNGKey, gain: float | None = None):
+        """With a gain: orthogonal weights times it, no bias (Saxe et al. 2014; what PPO is usually given).
+
+        Without: weights and biases uniform in ±1/√in_size (the default of torch.nn.Linear).
+        """
         weight_key, bias_key = jax.random.split(key)
+        if gain is not None:
+            self.weight = jax.nn.initializers.orthogonal(gain)(weight_key, (out_size, in_size))
+            self.bias = jnp.zeros(out_size)
+            return
+        limit = max(in_size, 1) ** -0.5
         self.weight = jax.random.uniform(weight_key, (out_size, in_size), minval=-limit, maxval=limit)
         self.bias = jax.random.uniform(bias_key, (out_size,), minval=-limit, maxval=limit)
 
@@ -34,6 +41,23 @@ class Linear(eqx.Module):
             return y + self.bias.reshape(-1, *[1] * (x.ndim - 1))
         y = x @ self.weight.T
         return y + jnp.broadcast_to(self.bias, y.shape)
+
+
+class Mlp(eqx.Module):
+    """Affine layers with a ReLU after each of them."""
+
+    layers: tuple[Linear, ...]
+
+    def __init__(self, in_size: int, hidden_sizes: tuple[int, ...], key: PRNGKey, gain: float | None = None):
+        sizes = (in_size, *hidden_sizes)
+        keys = jax.random.split(key, len(hidden_sizes))
+        self.layers = tuple(Linear(i, o, k, gain) for i, o, k in zip(sizes, sizes[1:], keys, strict=False))
+
+    def __call__(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """[*b in] -> [*b out]"""
+        for layer in self.layers:
+            x = jax.nn.relu(layer(x))
+        return x
 
 
 def num_parameters(network: eqx.Module) -> int:

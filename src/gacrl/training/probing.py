@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gacrl.algorithms import algorithm as algorithms
-from gacrl.config import AlgorithmConfig
+from gacrl.config import AlgorithmConfig, TrainingConfig
 from gacrl.envs.probes import PROBES, Probe, ProbeParams
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.curriculum import constant
@@ -28,7 +28,8 @@ def probe_algorithm(
 ) -> ProbeResult:
     """Train on all probes, mapped over them, and say what was learned."""
     env = Probe()
-    algorithm = algorithms.make(config, env)
+    training = TrainingConfig(num_updates * num_envs * num_steps, num_envs, num_steps)
+    algorithm = algorithms.make(config, env, training)
     trainer = Trainer(algorithm, env, constant(), num_envs, num_steps)
 
     @jax.jit

@@ -71,7 +71,7 @@ def build(config: RunConfig) -> Trainer:
     """The compiled functions that train this configuration."""
     env = envs.make(config.env)
     return Trainer(
-        algorithm=algorithms.make(config.algorithm, env),
+        algorithm=algorithms.make(config.algorithm, env, config.training),
         env=env,
         curriculum=curriculum.make(config.curriculum, config.env),
         num_envs=config.training.num_envs,

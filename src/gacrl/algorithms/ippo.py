@@ -1,0 +1,11 @@
+"""IPPO (de Witt et al. 2020): PPO whose critic sees no more than its agent does."""
+
+from gacrl.algorithms import ppo
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.config import IppoConfig, TrainingConfig
+from gacrl.envs.environment import Environment
+
+
+def make(config: IppoConfig, env: Environment, training: TrainingConfig) -> Algorithm:
+    """PPO with a critic for each agent."""
+    return ppo.make(config, env, training, view="local")

@@ -1,0 +1,62 @@
+"""What learners minimise, as functions of arrays."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def clipped_surrogate(
+    log_prob: Float[Array, "*b"],
+    behaviour_log_prob: Float[Array, "*b"],
+    advantage: Float[Array, "*b"],
+    clip_eps: Float[Array, ""] | float,
+) -> Float[Array, "*b"]:
+    """PPO's clipped policy objective, to be minimised (Schulman et al. 2017, eq. 7); elementwise."""
+    ratio = jnp.exp(log_prob - behaviour_log_prob)
+    clipped = jnp.clip(ratio, 1.0 - clip_eps, 1.0 + clip_eps)
+    return -jnp.minimum(ratio * advantage, clipped * advantage)
+
+
+def huber(error: Float[Array, "*b"], delta: float) -> Float[Array, "*b"]:
+    """½ e² up to |e| = delta, linear beyond (Huber 1964); elementwise."""
+    small = jnp.minimum(jnp.abs(error), delta)
+    return 0.5 * jnp.square(small) + delta * (jnp.abs(error) - small)
+
+
+class ValueNorm(NamedTuple):
+    """Running first and second moment of the returns, with the bias of their start taken out (Adam's way)."""
+
+    first: Float[Array, ""]
+    second: Float[Array, ""]
+    weight: Float[Array, ""]
+
+    @property
+    def mean(self) -> Float[Array, ""]:
+        return self.first / jnp.maximum(self.weight, 1e-5)
+
+    @property
+    def sd(self) -> Float[Array, ""]:
+        variance = self.second / jnp.maximum(self.weight, 1e-5) - jnp.square(self.mean)
+        return jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
+
+    def normalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        return (values - self.mean) / self.sd
+
+    def denormalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        return values * self.sd + self.mean
+
+
+def no_returns() -> ValueNorm:
+    """Before any return was seen: normalising changes nothing."""
+    zero = jnp.zeros(())
+    return ValueNorm(zero, zero, zero)
+
+
+def follow_returns(norm: ValueNorm, returns: Float[Array, "*b"], step: float = 0.01) -> ValueNorm:
+    """Move the moments towards those of the returns (MAPPO's ValueNorm, with a step that suits short runs)."""
+    return ValueNorm(
+        norm.first + step * (returns.mean() - norm.first),
+        norm.second + step * (jnp.square(returns).mean() - norm.second),
+        norm.weight + step * (1.0 - norm.weight),
+    )

@@ -1,0 +1,310 @@
+"""Proximal policy optimisation of a team that shares its weights (Schulman et al. 2017; Yu et al. 2022).
+
+Top to bottom: how agents act, targets, the loss, one update. MAPPO and IPPO pass the view of their critic.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.algorithms.augmentation import turn_experience
+from gacrl.algorithms.exploration import progress_between
+from gacrl.algorithms.objectives import (
+    ValueNorm,
+    clipped_surrogate,
+    follow_returns,
+    huber,
+    no_returns,
+)
+from gacrl.algorithms.returns import generalised_advantages, n_step_returns
+from gacrl.algorithms.shared import mean_real, share_reward, taken
+from gacrl.config import PpoConfig, TrainingConfig
+from gacrl.envs.environment import Environment
+from gacrl.networks.agent import AgentNetwork, matched, unroll
+from gacrl.networks.critic import Critic, View
+from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+
+
+class Network(eqx.Module):
+    actor: AgentNetwork
+    critic: Critic
+
+
+class PpoMemory(NamedTuple):
+    """What actor and critic carry; () for a feed-forward network."""
+
+    actor: Memory
+    critic: Memory
+
+
+class Hyper(NamedTuple):
+    """The numbers that a sweep can vary."""
+
+    learning_rate: Float[Array, ""] | float
+    learning_rate_end: Float[Array, ""] | float
+    ent_coef: Float[Array, ""] | float
+    ent_coef_end: Float[Array, ""] | float
+    gamma: Float[Array, ""] | float
+    gae_lambda: Float[Array, ""] | float
+    clip_eps: Float[Array, ""] | float
+    vf_coef: Float[Array, ""] | float
+    planned_updates: Float[Array, ""] | float
+    """Over which learning rate and entropy weight move; they stay at their end after it."""
+
+
+class LearnerState(NamedTuple):
+    network: Network
+    optimizer: optax.OptState
+    norm: ValueNorm
+    updates: Int[Array, ""]
+    hyper: Hyper
+
+
+class Sample(NamedTuple):
+    """Segments of a rollout to learn from, [L, B, …]: L steps that follow each other, B of them."""
+
+    observation: Observation
+    first: Bool[Array, "L B"]
+    action: Int[Array, "L B N"]
+    key: Key[Array, "L B"]
+    """What the agents drew with: the loss draws the same again, so that the first ratio is 1."""
+    log_prob: Float[Array, "L B N"]
+    advantage: Float[Array, "L B N"]
+    target: Float[Array, "L B N"]
+    """Of the critic, in normalised units."""
+
+
+def log_policy(logits: Float[Array, "*b A"], action_mask: Bool[Array, "*b A"]) -> Float[Array, "*b A"]:
+    """log π; −∞ for actions that are not available."""
+    return jax.nn.log_softmax(jnp.where(action_mask, logits, -jnp.inf))
+
+
+def entropy(log_probs: Float[Array, "*b A"]) -> Float[Array, "*b"]:
+    """Of categorical distributions, in nats; actions with probability 0 count nothing."""
+    probs = jnp.exp(log_probs)
+    return -(probs * jnp.where(probs > 0, log_probs, 0.0)).sum(-1)
+
+
+def loss(
+    network: Network,
+    sample: Sample,
+    memory: PpoMemory,
+    hyper: Hyper,
+    ent_coef: Float[Array, ""],
+    huber_delta: float,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Policy, critic and entropy terms on segments; means over the real agents.
+
+    memory: what actor and critic carried before each segment, [B, …].
+    """
+
+    def one(observation: Observation, first: Array, key: Array, memory: PpoMemory):
+        acted, _ = unroll(network.actor, observation, first, memory.actor, key)
+        return acted.head, evaluate_critic(network.critic, observation, first, memory.critic)[0]
+
+    logits, value = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
+    log_probs = log_policy(logits, sample.observation.action_mask)
+    log_prob = taken(log_probs, sample.action)
+    real = sample.observation.agent_mask
+    parts = {
+        "loss_policy": clipped_surrogate(log_prob, sample.log_prob, sample.advantage, hyper.clip_eps),
+        "loss_critic": huber(value - sample.target, huber_delta),
+        "entropy": entropy(log_probs),
+        "ratio_clipped": (jnp.abs(jnp.exp(log_prob - sample.log_prob) - 1) > hyper.clip_eps) * 1.0,
+        "kl": sample.log_prob - log_prob,
+    }
+    parts = {name: mean_real(values, real) for name, values in parts.items()}
+    total = parts["loss_policy"] + hyper.vf_coef * parts["loss_critic"] - ent_coef * parts["entropy"]
+    return total, parts
+
+
+def evaluate_critic(
+    critic: Critic, observation: Observation, first: Bool[Array, " L"], memory: Memory
+) -> tuple[Float[Array, "L N"], Memory]:
+    """Values along a segment of one environment, and the critic's memory after each step."""
+    if critic.memory is None:
+        return jax.vmap(lambda seen: critic(seen)[0])(observation), ()
+    fresh = critic.initial_memory(observation.features.shape[-2])
+
+    def step(memory: Memory, inputs: tuple[Observation, Array]):
+        seen, first = inputs
+        value, memory = critic(seen, jnp.where(first, fresh, memory))
+        return memory, (value, memory)
+
+    return jax.lax.scan(step, memory, (observation, first))[1]
+
+
+def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: View) -> Algorithm:
+    """PPO for this task's shapes, with the critic's view. Needs discrete actions."""
+    adam = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.flatten(optax.scale_by_adam(eps=1e-5))
+    )
+    settings = matched(env, config.network, env.num_actions)
+    per_update = training.num_envs * training.num_steps
+    hyper = Hyper(
+        learning_rate=config.learning_rate,
+        learning_rate_end=config.learning_rate_end,
+        ent_coef=config.ent_coef,
+        ent_coef_end=config.ent_coef_end,
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
+        clip_eps=config.clip_eps,
+        vf_coef=config.vf_coef,
+        planned_updates=max(1.0, training.env_steps / per_update),
+    )
+
+    def networks(key: PRNGKey) -> Network:
+        actor_key, critic_key = jax.random.split(key)
+        gain = 2**0.5
+        return Network(
+            AgentNetwork(env, settings, env.num_actions, actor_key, gain, head_gain=0.01),
+            Critic(env, settings, view, critic_key, gain),
+        )
+
+    def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
+        network = networks(key)
+        return LearnerState(
+            network=network,
+            optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
+            norm=no_returns(),
+            updates=jnp.zeros((), jnp.int32),
+            hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
+        )
+
+    def initial_memory(num_agents: int) -> Memory:
+        network = eqx.filter_eval_shape(networks, jax.random.key(0))
+        memory = PpoMemory(network.actor.initial_memory(num_agents), network.critic.initial_memory(num_agents))
+        return memory if jax.tree.leaves(memory) else ()
+
+    def policy(learner: LearnerState, explore: bool) -> Policy:
+        def act(
+            memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
+        ) -> tuple[Decision, Memory]:
+            actor_memory, critic_memory = memory or PpoMemory((), ())
+            talk_key, choice_key = jax.random.split(key)
+            output, actor_memory = learner.network.actor(
+                observation, actor_memory, talk_key if explore else None, channel
+            )
+            log_probs = log_policy(output.head, observation.action_mask)
+            action = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
+            value, critic_memory = learner.network.critic(observation, critic_memory)
+            extras = {
+                "value": learner.norm.denormalise(value),
+                "log_prob": taken(log_probs, action),
+                "key": talk_key,
+            }
+            decision = Decision(action, output.message, output.adjacency, extras)
+            return decision, PpoMemory(actor_memory, critic_memory) if memory else ()
+
+        return act
+
+    def experience_of(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> Transition:
+        """The rollout; turned by a symmetry for each environment, where that is asked for.
+
+        What the acting policy thinks is then asked again, of the turned world.
+        """
+        if not config.augment:
+            return rollout.transitions
+        steps = turn_experience(env, rollout.transitions, key)
+        memory = split_memory(rollout.first_memory)
+
+        def again(steps: Transition, memory: PpoMemory):
+            key = steps.decision.extras["key"]
+            acted, _ = unroll(learner.network.actor, steps.observation, steps.first, memory.actor, key)
+            value, _ = evaluate_critic(learner.network.critic, steps.observation, steps.first, memory.critic)
+            return log_policy(acted.head, steps.observation.action_mask), value
+
+        log_probs, value = jax.vmap(again, (1, 0), 1)(steps, memory)
+        extras = {
+            **steps.decision.extras,
+            "log_prob": taken(log_probs, steps.decision.action),
+            "value": learner.norm.denormalise(value),
+        }
+        return steps._replace(decision=steps.decision._replace(extras=extras))
+
+    def targets(
+        learner: LearnerState, steps: Transition, memory: PpoMemory
+    ) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
+        """Advantages and returns of every agent, in the units of the reward."""
+        critic = learner.network.critic
+
+        def after(steps: Transition, memory: Memory) -> Float[Array, "T N"]:
+            if critic.memory is None:
+                return jax.vmap(lambda seen: critic(seen)[0])(steps.next_observation)
+            _, memories = evaluate_critic(critic, steps.observation, steps.first, memory)
+            return jax.vmap(lambda seen, memory: critic(seen, memory)[0])(steps.next_observation, memories)
+
+        next_value = learner.norm.denormalise(jax.vmap(after, (1, 0), 1)(steps, memory.critic))
+        reward = share_reward(steps.reward, steps.observation.agent_mask, config.reward == "team")
+        value = steps.decision.extras["value"]
+        ends = (steps.terminated[..., None], steps.truncated[..., None])
+        terminated, truncated = (jnp.broadcast_to(end, reward.shape) for end in ends)
+        gamma = learner.hyper.gamma
+        if config.n_step:
+            returns = n_step_returns(reward, next_value, terminated, truncated, gamma, config.n_step)
+            return returns - value, returns
+        advantage = generalised_advantages(
+            reward, value, next_value, terminated, truncated, gamma, learner.hyper.gae_lambda
+        )
+        return advantage, advantage + value
+
+    def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+        turn_key, shuffle_key = jax.random.split(key)
+        memory = split_memory(rollout.first_memory)
+        steps = experience_of(learner, rollout, turn_key)
+        advantage, returns = targets(learner, steps, memory)
+        norm = follow_returns(learner.norm, returns) if config.value_norm else learner.norm
+        real = steps.observation.agent_mask
+        centre = mean_real(advantage, real)
+        spread = jnp.sqrt(mean_real(jnp.square(advantage - centre), real))
+        sample = Sample(
+            observation=steps.observation,
+            first=steps.first,
+            action=steps.decision.action,  # pyright: ignore[reportArgumentType] discrete
+            key=steps.decision.extras["key"],
+            log_prob=steps.decision.extras["log_prob"],
+            advantage=(advantage - centre) / (spread + 1e-8),
+            target=norm.normalise(returns),
+        )
+        if not jax.tree.leaves(memory):  # nothing holds the steps together: each is a segment
+            sample = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), sample)
+        hyper, fraction = learner.hyper, learner.updates / learner.hyper.planned_updates
+        learning_rate = progress_between(hyper.learning_rate, hyper.learning_rate_end, fraction)
+        ent_coef = progress_between(hyper.ent_coef, hyper.ent_coef_end, fraction)
+
+        def gradient_step(loop: tuple[Network, Any], rows: Int[Array, " rows"]):
+            network, optimizer = loop
+            part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
+            remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
+            gradients, metrics = jax.grad(loss, has_aux=True)(
+                network, part, remembered, hyper, ent_coef, config.huber_delta
+            )
+            directions, optimizer = adam.update(gradients, optimizer)
+            network = jax.tree.map(lambda w, d: w - learning_rate * d, network, directions)
+            return (network, optimizer), metrics
+
+        rows = minibatches(shuffle_key, sample.first.shape[1], config.update_epochs, config.num_minibatches)
+        (network, optimizer), metrics = jax.lax.scan(gradient_step, (learner.network, learner.optimizer), rows)
+        metrics = {name: values.mean() for name, values in metrics.items()}
+        metrics |= {"learning_rate": learning_rate, "value_error": mean_real(jnp.abs(advantage), real)}
+        return LearnerState(network, optimizer, norm, learner.updates + 1, hyper), metrics
+
+    return Algorithm(init, initial_memory, policy, update, hyper)
+
+
+def split_memory(memory: Memory) -> PpoMemory:
+    """A policy's memory as actor's and critic's."""
+    return memory if isinstance(memory, PpoMemory) else PpoMemory((), ())
+
+
+def minibatches(key: PRNGKey, size: int, epochs: int, count: int) -> Int[Array, "steps rows"]:
+    """Shuffled rows, anew for each epoch; what does not fill a minibatch is left out of that epoch."""
+    count = min(count, size)
+    rows = size // count
+    shuffled = jax.vmap(lambda key: jax.random.permutation(key, size))(jax.random.split(key, epochs))
+    return shuffled[:, : rows * count].reshape(epochs * count, rows)

@@ -1,0 +1,290 @@
+"""Q-learning of a team from replay, shared by QMIX, VDN, IQL and GACRL: they pass what is theirs in `Parts`.
+
+Top to bottom: what a learner passes, what is remembered, how agents act, the loss, one update. Double Q-learning
+(van Hasselt et al. 2016), n-step targets, a target network that follows slowly. Messages and recurrent memories
+are not remembered as data but made anew by the network that is learning.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.algorithms import replay as ring
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.algorithms.augmentation import turn_experience
+from gacrl.algorithms.exploration import Exploration, progress_between
+from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
+from gacrl.algorithms.returns import n_step_window
+from gacrl.algorithms.shared import share_reward
+from gacrl.config import QLearningConfig, TrainingConfig
+from gacrl.envs.environment import Environment
+from gacrl.networks.agent import AgentNetwork, AgentOutput, unroll
+from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+
+HUBER_DELTA = 10.0
+"""Errors beyond this count linearly."""
+
+
+class Network(eqx.Module):
+    """What is learned: the agents' network, whose head gives a number for each action, and the team's part."""
+
+    agent: AgentNetwork
+    team: Any
+
+
+TeamValue = Callable[[Network, Float[Array, "N A"], Int[Array, " N"], Observation], Float[Array, " M"]]
+"""(network, the head's numbers, actions, observation) -> what is learned: the team's value, or each agent's."""
+
+
+class Parts(NamedTuple):
+    """What makes a learner out of this file."""
+
+    networks: Callable[[PRNGKey], Network]
+    team_value: TeamValue
+    exploration: Exploration
+    auxiliary: Callable[[AgentOutput], Metrics]
+    """Further terms of the loss, weighted already, from what the network put out; {} for none."""
+    averaged: bool = False
+    """Play greedily with the slow target network, a running mean of the parameters."""
+
+
+class Experience(NamedTuple):
+    """What the replay remembers of a step of one environment."""
+
+    transition: Transition
+    memory: Memory
+    """The network's, before the step."""
+
+
+class ActMemory(NamedTuple):
+    """The policy's memory: the network's, and what exploration settled at the start of the episode."""
+
+    network: Memory
+    exploration: Any
+
+
+class Hyper(NamedTuple):
+    """The numbers that a sweep can vary."""
+
+    learning_rate: Float[Array, ""] | float
+    learning_rate_end: Float[Array, ""] | float
+    gamma: Float[Array, ""] | float
+    target_step: Float[Array, ""] | float
+    planned_steps: Float[Array, ""] | float
+    """Environment steps over which the learning rate moves; it stays at its end after them."""
+
+
+class LearnerState(NamedTuple):
+    network: Network
+    target: Network
+    optimizer: optax.OptState
+    replay: ring.Replay[Float[Array, "capacity E W"]]
+    """Of experiences, each packed into one vector."""
+    rewards: ValueNorm
+    """Running moments of the reward."""
+    exploration: Any
+    env_steps: Int[Array, ""]
+    hyper: Hyper
+
+
+def epsilon_greedy(
+    key: PRNGKey, values: Float[Array, "N A"], action_mask: Bool[Array, "N A"], epsilon: Float[Array, ""]
+) -> Int[Array, " N"]:
+    """The best available action, or with probability ε any available one."""
+    explore_key, action_key = jax.random.split(key)
+    anything = jax.random.categorical(action_key, jnp.where(action_mask, 0.0, -jnp.inf))
+    exploring = jax.random.bernoulli(explore_key, epsilon, anything.shape)
+    return jnp.where(exploring, anything, greedy(values, action_mask))
+
+
+def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[Array, " N"]:
+    """The best available action of each agent."""
+    return jnp.where(action_mask, values, -jnp.inf).argmax(-1)
+
+
+def make(config: QLearningConfig, env: Environment, training: TrainingConfig, parts: Parts) -> Algorithm:
+    """The learner for this task's shapes. Needs discrete actions."""
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    adam = optax.flatten(optax.chain(clip, optax.scale_by_adam()))
+    num_envs, num_steps = training.num_envs, training.num_steps
+    learned, window = config.sequence_length, config.sequence_length + config.n_step - 1
+    rows = max(-(-config.replay_capacity // (num_envs * num_steps)), -(-window // num_steps)) * num_steps
+    hyper = Hyper(
+        learning_rate=config.learning_rate,
+        learning_rate_end=config.learning_rate_end,
+        gamma=config.gamma,
+        target_step=config.target_step,
+        planned_steps=training.env_steps,
+    )
+    shapes = eqx.filter_eval_shape(parts.networks, jax.random.key(0))
+    nothing_remembered = shapes.agent.initial_memory(env.num_agents)
+    forgetful = not jax.tree.leaves(nothing_remembered)
+
+    def initial_memory(num_agents: int) -> Memory:
+        memory = ActMemory(shapes.agent.initial_memory(num_agents), parts.exploration.initial_memory)
+        return memory if jax.tree.leaves(memory) else ()
+
+    def example() -> Experience:
+        """A step's shapes."""
+        state, observation = env.reset(jax.random.key(0))
+        action = jnp.zeros(env.num_agents, jnp.int32)
+        after, false = env.step(state, action, jax.random.key(0))[1], jnp.zeros((), bool)
+        step = Transition(observation, Decision(action), after.reward, false, false, false, after.observation, {})
+        return Experience(step, nothing_remembered)
+
+    packed, unpack = ring.packing(
+        jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(example))
+    )
+
+    def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
+        network = parts.networks(key)
+        return LearnerState(
+            network=network,
+            target=network,
+            optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
+            replay=ring.empty(jnp.zeros((num_envs, packed.size)), rows),
+            rewards=no_returns(),
+            exploration=parts.exploration.init(),
+            env_steps=jnp.zeros((), jnp.int32),
+            hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
+        )
+
+    def policy(learner: LearnerState, explore: bool) -> Policy:
+        network = learner.target if parts.averaged and not explore else learner.network
+        level = parts.exploration.level(learner.exploration, learner.env_steps)
+
+        def act(
+            memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
+        ) -> tuple[Decision, Memory]:
+            remembered = memory if isinstance(memory, ActMemory) else ActMemory((), ())
+            mode_key, talk_key, action_key = jax.random.split(key, 3)
+            mode = remembered.exploration
+            output, after = network.agent(
+                observation, remembered.network, talk_key if explore else None, channel, level.temperature
+            )
+            if explore:
+                mode, epsilon = parts.exploration.begin(mode, mode_key, level.epsilon)
+                action = epsilon_greedy(action_key, output.head, observation.action_mask, epsilon)
+            else:
+                action = greedy(output.head, observation.action_mask)
+            best = greedy(output.head, observation.action_mask)
+            value = parts.team_value(network, output.head, best, observation).mean()
+            extras = {"value": jnp.broadcast_to(value, action.shape), "memory": remembered.network, "mode": mode}
+            decision = Decision(action, output.message, output.adjacency, extras)
+            return decision, ActMemory(after, mode) if isinstance(memory, ActMemory) else ()
+
+        return act
+
+    def outputs(
+        network: Network, steps: Transition, memory: Memory, key: PRNGKey | None, temperature: Array
+    ) -> tuple[AgentOutput, Memory]:
+        """Along a window: what is put out, and the memory after each step."""
+        keys = None if key is None else jax.random.split(key, steps.first.shape[0])
+        return unroll(network.agent, steps.observation, steps.first, memory, keys, temperature)
+
+    def bootstrap(
+        network: Network, target: Network, observation: Observation, memory: Memory, target_memory: Memory
+    ) -> Float[Array, " M"]:
+        """The target network's value of the actions that are best: by the online network with double Q."""
+        theirs = target.agent(observation, target_memory)[0].head
+        chooser = network.agent(observation, memory)[0].head if config.double_q else theirs
+        return parts.team_value(target, theirs, greedy(chooser, observation.action_mask), observation)
+
+    def one_window(
+        network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """The loss on one window [W, …] of one environment."""
+        seen, target = steps.transition, learner.target
+        memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
+        temperature = parts.exploration.level(learner.exploration, learner.env_steps).temperature
+        now = jax.tree.map(lambda leaf: leaf[:learned], seen)
+        if forgetful:
+            online, _ = outputs(network, now, (), key, temperature)
+            memories = target_memories = ()
+        else:  # all of the window: bootstrapping starts from the memory at its end
+            online, memories = outputs(network, seen, memory, key, temperature)
+            _, target_memories = outputs(target, seen, memory, None, temperature)
+            online = jax.tree.map(lambda leaf: leaf[:learned], online)
+        value = jax.vmap(lambda *now: parts.team_value(network, *now))(
+            online.head, now.decision.action, now.observation
+        )
+
+        weight, last = n_step_window(seen.terminated | seen.truncated, config.n_step)
+        last = last[:learned]
+        after = jax.tree.map(lambda leaf: leaf[last], (seen.next_observation, memories, target_memories))
+        future = jax.vmap(lambda *after: bootstrap(network, target, *after))(*after)
+        reward = share_reward(seen.reward, seen.observation.agent_mask, config.reward == "team")
+        reward = rewards.normalise(reward)[:, : value.shape[-1]]
+        gamma = learner.hyper.gamma
+        earned = sum(gamma**k * weight[k, :learned, None] * reward[k : k + learned] for k in range(config.n_step))
+        length = last - jnp.arange(learned) + 1
+        discount = gamma ** length[:, None] * ~seen.terminated[last][:, None]
+        error = value - jax.lax.stop_gradient(earned + discount * future)
+        real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
+        td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
+        auxiliary = parts.auxiliary(online)
+        metrics = {"loss_td": td, "value": value.mean(), **auxiliary}
+        return td + sum(auxiliary.values(), jnp.zeros(())), metrics
+
+    def loss(
+        network: Network, learner: LearnerState, rewards: ValueNorm, batch: Experience, keys: Array
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """The mean over windows [W, B, …]."""
+        losses = jax.vmap(lambda steps, key: one_window(network, learner, rewards, steps, key), (1, 0))(
+            batch, keys
+        )
+        return jax.tree.map(lambda values: values.mean(0), losses)
+
+    def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+        """Remember a rollout, then take the configured gradient steps."""
+        steps = rollout.transitions
+        kept = steps._replace(decision=Decision(steps.decision.action), info={})
+        block = Experience(kept, steps.decision.extras["memory"])
+        replay = ring.add_block(learner.replay, jax.vmap(jax.vmap(ring.pack))(block))
+        rewards = learner.rewards
+        if config.reward_norm:
+            earned = share_reward(steps.reward, steps.observation.agent_mask, config.reward == "team")
+            rewards = follow_returns(rewards, earned)
+        env_steps = learner.env_steps + num_envs * num_steps
+        exploration = parts.exploration.follow(learner.exploration, steps)
+        learner = learner._replace(replay=replay, rewards=rewards, exploration=exploration, env_steps=env_steps)
+        hyper = learner.hyper
+        learning_rate = progress_between(
+            hyper.learning_rate, hyper.learning_rate_end, env_steps / hyper.planned_steps
+        )
+
+        def gradient_step(learner: LearnerState, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+            rows_key, env_key, turn_key, noise_key = jax.random.split(key, 4)
+            rows = ring.sample_windows(replay, rows_key, config.batch_size, window)
+            envs = jax.random.randint(env_key, (config.batch_size,), 0, num_envs)
+            sampled = replay.items.at[rows, envs].get(mode="promise_in_bounds")
+            batch = jax.vmap(jax.vmap(unpack))(sampled)
+            if config.augment:
+                batch = batch._replace(transition=turn_experience(env, batch.transition, turn_key))
+            keys = jax.random.split(noise_key, config.batch_size)
+            gradients, metrics = jax.grad(loss, has_aux=True)(learner.network, learner, rewards, batch, keys)
+            directions, optimizer = adam.update(gradients, learner.optimizer)
+            network = jax.tree.map(lambda w, d: w - learning_rate * d, learner.network, directions)
+            target = jax.tree.map(lambda old, new: old + hyper.target_step * (new - old), learner.target, network)
+            return learner._replace(network=network, target=target, optimizer=optimizer), metrics
+
+        light = learner._replace(replay=())  # the loops below must not carry, and copy, the replay
+
+        def learn(learner: LearnerState) -> tuple[LearnerState, Metrics]:
+            learner, metrics = jax.lax.scan(gradient_step, learner, jax.random.split(key, config.updates))
+            return learner, jax.tree.map(lambda values: values.mean(), metrics)
+
+        told = jax.eval_shape(learn, light)[1]
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), told)
+        ready = env_steps >= max(config.learning_starts, window * num_envs)
+        light, metrics = jax.lax.cond(ready, learn, lambda learner: (learner, nothing), light)
+        level = parts.exploration.level(exploration, env_steps)
+        metrics |= {"epsilon": level.epsilon, "temperature": level.temperature, "learning_rate": learning_rate}
+        return light._replace(replay=replay), metrics
+
+    return Algorithm(init, initial_memory, policy, update, hyper)

@@ -1,0 +1,24 @@
+"""Small functions on a team's arrays that more than one learner needs."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+def taken(values: Float[Array, "*b A"], action: Int[Array, "*b"]) -> Float[Array, "*b"]:
+    """The entry of the action taken. (A product with the one-hot: the gradient of a lookup is a slow scatter.)"""
+    chosen = jax.nn.one_hot(action, values.shape[-1], dtype=bool)
+    return jnp.where(chosen, values, 0.0).sum(-1)
+
+
+def mean_real(values: Float[Array, "*b"], real: Bool[Array, "*b"]) -> Float[Array, ""]:
+    """Mean over the real agents."""
+    return jnp.where(real, values, 0.0).sum() / jnp.maximum(real.sum(), 1)
+
+
+def share_reward(reward: Float[Array, "*b N"], real: Bool[Array, "*b N"], team: bool) -> Float[Array, "*b N"]:
+    """The mean over the real agents for everyone, or each its own."""
+    if not team:
+        return reward
+    mean = jnp.where(real, reward, 0.0).sum(-1, keepdims=True) / jnp.maximum(real.sum(-1, keepdims=True), 1)
+    return jnp.broadcast_to(mean, reward.shape)

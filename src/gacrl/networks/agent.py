@@ -1,0 +1,153 @@
+"""The network of the agents: torso, memory, communication and a head, in this order, each by a setting.
+
+Q-learning takes the head for the values of the actions, PPO for logits, and critics have a head of one.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from gacrl.config import NetworkConfig
+from gacrl.envs.environment import Environment
+from gacrl.networks import communication
+from gacrl.networks import torso as torsos
+from gacrl.networks.communication import Communication, Neighbourhood
+from gacrl.networks.graph import observed_adjacency
+from gacrl.networks.layers import Linear, num_parameters
+from gacrl.types import Channel, Memory, Observation, PRNGKey
+
+
+class AgentMemory(NamedTuple):
+    """What an agent network carries from step to step; () for what it does not have."""
+
+    carry: Any
+    inbox: Any
+
+
+class AgentOutput(NamedTuple):
+    head: Float[Array, "N A"]
+    hidden: Float[Array, "N H"]
+    message: Float[Array, "N V"] | None
+    adjacency: Bool[Array, "N N"]
+    entropy: Float[Array, " N"] | float
+    """Of the symbols sent, nats; 0 without symbols."""
+
+
+class AgentNetwork(eqx.Module):
+    """Shared by all agents; for one environment at one step."""
+
+    torso: torsos.Torso
+    memory: eqx.nn.GRUCell | None
+    communication: Communication
+    head: Linear
+    radius: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        env: Environment,
+        config: NetworkConfig,
+        num_outputs: int,
+        key: PRNGKey,
+        gain: float | None = None,
+        head_gain: float | None = None,
+    ):
+        """gain, head_gain: orthogonal initialisation, where they are given."""
+        torso_key, memory_key, communication_key, head_key = jax.random.split(key, 4)
+        self.torso = torsos.make(env, config, torso_key, gain)
+        self.memory = eqx.nn.GRUCell(config.width, config.width, key=memory_key) if config.recurrent else None
+        self.communication = communication.make(config, communication_key, gain)
+        self.head = Linear(config.width, num_outputs, head_key, head_gain)
+        self.radius = config.radius
+
+    def initial_memory(self, num_agents: int) -> Memory:
+        """() for a network that remembers nothing."""
+        inbox = self.communication.empty_inbox(num_agents)
+        if self.memory is None and isinstance(inbox, tuple):
+            return ()
+        carry = () if self.memory is None else jnp.zeros((num_agents, self.memory.hidden_size))
+        return AgentMemory(carry, inbox)
+
+    def __call__(
+        self,
+        observation: Observation,
+        memory: Memory = (),
+        key: PRNGKey | None = None,
+        channel: Channel | None = None,
+        temperature: Float[Array, ""] | float = 1.0,
+    ) -> tuple[AgentOutput, Memory]:
+        """Without a key nothing is drawn: the most likely symbols, DIAL's bits."""
+        channel = Channel() if channel is None else channel
+        adjacency = observed_adjacency(observation, self.radius)
+        near = Neighbourhood(adjacency, _offsets(observation))
+        remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
+        hidden = self.torso(observation)
+        hidden = self.communication.hear(hidden, remembered.inbox, near, channel, key)
+        carry = remembered.carry
+        if self.memory is not None:
+            carry = hidden = jax.vmap(self.memory)(hidden, carry)
+        spoken = self.communication.speak(hidden, near, channel, key, temperature)
+        output = AgentOutput(self.head(spoken.hidden), spoken.hidden, spoken.message, adjacency, spoken.entropy)
+        if not isinstance(memory, AgentMemory):
+            return output, ()
+        return output, AgentMemory(carry, spoken.inbox)
+
+
+def unroll(
+    network: AgentNetwork,
+    observations: Observation,
+    first: Bool[Array, " T"],
+    memory: Memory,
+    keys: Key[Array, " T"] | None,
+    temperature: Float[Array, ""] | float = 1.0,
+) -> tuple[AgentOutput, Memory]:
+    """The network over T steps of one environment: outputs, and the memory *after* each step, [T, …].
+
+    The memory starts anew where `first`. Without a memory all steps are computed at once.
+    """
+    if not isinstance(memory, AgentMemory):
+        return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
+    fresh = network.initial_memory(first_axis(observations))
+
+    def step(memory: Memory, inputs: tuple[Observation, Bool[Array, ""], Any]):
+        seen, first, key = inputs
+        memory = jax.tree.map(lambda new, old: jnp.where(first, new, old), fresh, memory)
+        output, memory = network(seen, memory, key, None, temperature)
+        return memory, (output, memory)
+
+    return jax.lax.scan(step, memory, (observations, first, keys))[1]
+
+
+def first_axis(observations: Observation) -> int:
+    """N of observations [T, N, O]."""
+    return observations.features.shape[-2]
+
+
+def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> NetworkConfig:
+    """The configuration with the width at which the network's parameters come nearest to those asked for."""
+    wanted = config.parameters
+    if wanted is None:
+        return config
+
+    def size(width: int) -> int:
+        at = replace(config, width=width, parameters=None)
+        return num_parameters(eqx.filter_eval_shape(AgentNetwork, env, at, num_outputs, jax.random.key(0)))
+
+    low, high = 2, 4
+    while size(high) < wanted and high < 65_536:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if size(middle) < wanted else (low, middle)
+    width = min((low, high), key=lambda width: abs(size(width) - wanted))
+    return replace(config, width=width, parameters=None)
+
+
+def _offsets(observation: Observation) -> Float[Array, "N N 2"]:
+    num_agents = observation.features.shape[0]
+    if observation.positions is None:
+        return jnp.zeros((num_agents, num_agents, 2))
+    return observation.positions[None, :, :] - observation.positions[:, None, :]

@@ -1,0 +1,210 @@
+"""How agents talk: nothing, CommNet's averages, DIAL's regularised units, or discrete symbols over the graph.
+
+Each kind is a module with two moments: `hear` takes in what was said at the last step (DIAL), `speak` says
+something now and takes in what the others say now (CommNet, discrete). All messages pass
+`networks.messages.transmit`, so that a channel silences, delays and scrambles all of them alike.
+"""
+
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from gacrl.config import NetworkConfig
+from gacrl.networks.layers import Linear, Mlp
+from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, transmit
+from gacrl.types import Channel, PRNGKey
+
+
+class Neighbourhood(NamedTuple):
+    """Who hears whom, and where the speakers stand."""
+
+    adjacency: Bool[Array, "N N"]
+    """Entry [i, j]: j's message reaches i."""
+    offsets: Float[Array, "N N 2"]
+    """From i to j; 0 where the task has no space."""
+
+
+class Spoken(NamedTuple):
+    hidden: Float[Array, "N H"]
+    message: Float[Array, "N V"] | None
+    inbox: Any
+    """What is carried to the next step: () but for DIAL."""
+    entropy: Float[Array, " N"] | float = 0.0
+    """Of the symbols sent, in nats, mean over the rounds."""
+
+
+class Silence(eqx.Module):
+    """No communication."""
+
+    def empty_inbox(self, num_agents: int) -> Any:
+        return ()
+
+    def hear(self, hidden: Array, inbox: Any, near: Neighbourhood, channel: Channel, key: PRNGKey | None) -> Array:
+        return hidden
+
+    def speak(
+        self,
+        hidden: Float[Array, "N H"],
+        near: Neighbourhood,
+        channel: Channel,
+        key: PRNGKey | None,
+        temperature: Float[Array, ""] | float,
+    ) -> Spoken:
+        return Spoken(hidden, None, ())
+
+
+class CommNet(Silence):
+    """h ← tanh(H h + C mean of the neighbours' h), for some rounds (Sukhbaatar et al. 2016, eq. 2 and 3)."""
+
+    own: tuple[Linear, ...]
+    heard: tuple[Linear, ...]
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+        own_key, heard_key = jax.random.split(key)
+        width, rounds = config.width, config.rounds
+        self.own = tuple(Linear(width, width, k, gain) for k in jax.random.split(own_key, rounds))
+        self.heard = tuple(Linear(width, width, k, gain) for k in jax.random.split(heard_key, rounds))
+
+    def speak(
+        self,
+        hidden: Float[Array, "N H"],
+        near: Neighbourhood,
+        channel: Channel,
+        key: PRNGKey | None,
+        temperature: Float[Array, ""] | float,
+    ) -> Spoken:
+        message = hidden
+        for own, heard in zip(self.own, self.heard, strict=True):
+            message = hidden
+            received = _received(message, channel, key)
+            hidden = jnp.tanh(own(hidden) + heard(_mean(received, near.adjacency)))
+        return Spoken(hidden, message, ())
+
+
+class Dial(Silence):
+    """Messages of V numbers that are noisy sigmoids while learning and bits when not (Foerster et al. 2016).
+
+    What is said at a step is heard at the next one, and gradients flow back through it from hearer to speaker.
+    """
+
+    encode: Linear
+    decode: Linear
+    noise: float = eqx.field(static=True)
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+        encode_key, decode_key = jax.random.split(key)
+        self.encode = Linear(config.width, config.vocabulary, encode_key, gain)
+        self.decode = Linear(config.vocabulary, config.width, decode_key, gain)
+        self.noise = config.dial_noise
+
+    def empty_inbox(self, num_agents: int) -> Any:
+        return jnp.zeros((num_agents, self.encode.bias.shape[0]))
+
+    def hear(self, hidden: Array, inbox: Any, near: Neighbourhood, channel: Channel, key: PRNGKey | None) -> Array:
+        heard = _mean(_received(inbox, channel, key), near.adjacency)
+        return hidden + jax.nn.relu(self.decode(heard))
+
+    def speak(
+        self,
+        hidden: Float[Array, "N H"],
+        near: Neighbourhood,
+        channel: Channel,
+        key: PRNGKey | None,
+        temperature: Float[Array, ""] | float,
+    ) -> Spoken:
+        message = discretise_regularise(self.encode(hidden), key, self.noise)
+        return Spoken(hidden, message, message)
+
+
+class Symbols(Silence):
+    """Rounds of discrete messages: one symbol for each agent and round, straight-through Gumbel-Softmax.
+
+    A receiver knows where the speaker stands: an edge's embedding is of the symbol and the offset. Over the
+    neighbours: attention by the receiver, and the mean with it.
+    """
+
+    encode: tuple[Linear, ...]
+    edge: tuple[Mlp, ...]
+    attention: tuple[Linear, ...]
+    merge: tuple[Linear, ...]
+    straight_through: bool = eqx.field(static=True)
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+        width, narrow, symbols = config.width, config.width // 2, config.vocabulary
+        encode, edge, attention, merge = jax.random.split(key, (4, config.rounds))
+        self.encode = tuple(Linear(width, symbols, k, gain) for k in encode)
+        self.edge = tuple(Mlp(symbols + 3, (narrow,), k, gain) for k in edge)
+        self.attention = tuple(Linear(width + narrow, 1, k, gain) for k in attention)
+        self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
+        self.straight_through = config.communication == "discrete"
+
+    def speak(
+        self,
+        hidden: Float[Array, "N H"],
+        near: Neighbourhood,
+        channel: Channel,
+        key: PRNGKey | None,
+        temperature: Float[Array, ""] | float,
+    ) -> Spoken:
+        length = jnp.sqrt(jnp.square(near.offsets).sum(-1, keepdims=True) + 1e-8)
+        where = jnp.concatenate([near.offsets, length], axis=-1)
+        num_agents, message, entropy = hidden.shape[0], None, jnp.zeros(hidden.shape[0])
+        for number, (encode, edge, attention, merge) in enumerate(
+            zip(self.encode, self.edge, self.attention, self.merge, strict=True)
+        ):
+            logits = encode(hidden)
+            log_symbol = jax.nn.log_softmax(logits)
+            entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / len(self.encode)
+            if key is None:
+                message = most_likely_symbol(logits)
+            else:
+                noise = jax.random.gumbel(jax.random.fold_in(key, number), logits.shape)
+                message = gumbel_softmax(logits, noise, temperature, self.straight_through)
+            received = edge(jnp.concatenate([_received(message, channel, key), where], axis=-1))  # [N N H/2]
+            receiver = jnp.broadcast_to(hidden[:, None, :], (num_agents, num_agents, hidden.shape[-1]))
+            score = attention(jnp.concatenate([receiver, received], axis=-1))[..., 0]
+            heard = _weighted(received, jnp.where(near.adjacency, score, -jnp.inf))
+            hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
+        return Spoken(hidden, message, (), entropy)
+
+
+Communication: TypeAlias = Silence | CommNet | Dial | Symbols
+
+
+def make(config: NetworkConfig, key: PRNGKey, gain: float | None = None) -> Communication:
+    """The communication that the configuration names."""
+    if config.communication == "none":
+        return Silence()
+    kinds = {"commnet": CommNet, "dial": Dial, "discrete": Symbols, "soft": Symbols}
+    return kinds[config.communication](config, key, gain)
+
+
+def discretise_regularise(message: Float[Array, "N V"], key: PRNGKey | None, noise: float) -> Float[Array, "N V"]:
+    """DIAL's DRU: σ(m + noise · N(0, 1)) while learning (with a key), 1{m > 0} when not."""
+    if key is None:
+        return (message > 0).astype(message.dtype)
+    return jax.nn.sigmoid(message + noise * jax.random.normal(key, message.shape))
+
+
+def _received(message: Float[Array, "N V"], channel: Channel, key: PRNGKey | None) -> Float[Array, "N N V"]:
+    """Entry [i, j]: j's message as it reaches i."""
+    if channel == Channel():
+        return jnp.broadcast_to(message[None], (message.shape[0], *message.shape))
+    key = None if key is None else jax.random.fold_in(key, 1_000)
+    return jnp.moveaxis(transmit(message.T, channel, key)[0], 0, -1)
+
+
+def _mean(received: Float[Array, "N N V"], adjacency: Bool[Array, "N N"]) -> Float[Array, "N V"]:
+    """Over each agent's neighbours; 0 for an agent without any."""
+    weight = adjacency / jnp.maximum(adjacency.sum(1, keepdims=True), 1)
+    return jnp.einsum("ij,ijv->iv", weight, received)
+
+
+def _weighted(received: Float[Array, "N N V"], score: Float[Array, "N N"]) -> Float[Array, "N V"]:
+    """The mean weighted by the softmax of the scores; 0 for an agent without neighbours."""
+    largest = jax.lax.stop_gradient(jnp.max(score, axis=1, keepdims=True, initial=-1e9))
+    weight = jnp.exp(score - largest)
+    return jnp.einsum("ij,ijv->iv", weight, received) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)

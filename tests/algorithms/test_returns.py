@@ -1,0 +1,73 @@
+"""Advantages and n-step returns: by hand, and as rlax has them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rlax
+
+from gacrl.algorithms.returns import generalised_advantages, n_step_returns
+
+T = 12
+
+
+def test_advantages_by_hand():
+    """γ = ½, λ = ½: an episode that terminates after two steps, and one that is cut off after one."""
+    reward, value = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 2.0])
+    next_value = jnp.array([1.0, 100.0, 4.0])
+    terminated, truncated = jnp.array([False, True, False]), jnp.array([False, False, True])
+    found = generalised_advantages(reward, value, next_value, terminated, truncated, 0.5, 0.5)
+    # δ = 1 + ½·1 − ½ = 1;  2 − 1 = 1 (nothing follows);  3 + ½·4 − 2 = 3 (bootstrapped)
+    np.testing.assert_allclose(found, [1 + 0.25 * 1, 1, 3])
+
+
+def test_n_step_returns_by_hand():
+    reward = jnp.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    next_value = jnp.array([10.0, 20.0, 30.0, 40.0, 50.0])
+    terminated = jnp.array([False, False, True, False, False])
+    truncated = jnp.array([False, False, False, True, False])
+    found = n_step_returns(reward, next_value, terminated, truncated, 0.5, 2)
+    # Two rewards and a bootstrap; up to the end of the task; the end itself; up to the time limit; the last step.
+    np.testing.assert_allclose(found, [1 + 1 + 0.25 * 20, 2 + 2, 4, 8 + 20, 16 + 25])
+
+
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.7, 1.0])
+def test_advantages_are_those_of_rlax(gae_lambda: float):
+    numbers = np.random.default_rng(0)
+    reward, values = numbers.normal(size=T), numbers.normal(size=T + 1)
+    terminated = jnp.asarray(numbers.random(T) < 0.2)
+    expected = rlax.truncated_generalized_advantage_estimation(
+        jnp.asarray(reward), 0.9 * (1.0 - terminated), gae_lambda, jnp.asarray(values)
+    )
+    none = jnp.zeros(T, bool)
+    found = generalised_advantages(
+        jnp.asarray(reward),
+        jnp.asarray(values[:-1]),
+        jnp.asarray(values[1:]),
+        terminated,
+        none,
+        0.9,
+        gae_lambda,
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 3, 20])
+def test_n_step_returns_are_those_of_rlax(n: int):
+    numbers = np.random.default_rng(n)
+    reward, next_value = jnp.asarray(numbers.normal(size=T)), jnp.asarray(numbers.normal(size=T))
+    terminated = jnp.asarray(numbers.random(T) < 0.2)
+    expected = rlax.n_step_bootstrapped_returns(reward, 0.9 * (1.0 - terminated), next_value, n)
+    found = n_step_returns(reward, next_value, terminated, jnp.zeros(T, bool), 0.9, n)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_cut_off_step_is_bootstrapped_wherever_it_stands():
+    """A long chain of rewards 1 and the true value 1 / (1 − γ) everywhere: every target is that value."""
+    reward, value = jnp.ones(T), jnp.full(T, 10.0)
+    truncated = jnp.arange(T) % 5 == 4
+    none = jnp.zeros(T, bool)
+    for n in (1, 2, 7):
+        found = n_step_returns(reward, value, none, truncated, 0.9, n)
+        np.testing.assert_allclose(found, 10.0, rtol=1e-5)
+    found = generalised_advantages(reward, value, value, none, truncated, 0.9, 0.95)
+    np.testing.assert_allclose(found, 0.0, atol=1e-5)
