@@ -186,6 +186,10 @@ class NetworkConfig:
     """Hidden layers of the mlp torso."""
     recurrent: bool = False
     """A GRU after the torso."""
+    latent: Literal["none", "deterministic", "vae"] = "none"
+    """A narrow code of what the agent sees, which its symbols are made of: none, a code, or a Gaussian."""
+    latent_size: int = 16
+    """Numbers of the code."""
     communication: Literal["none", "commnet", "dial", "discrete", "soft"] = "none"
     """CommNet's averages, DIAL's regularised units, or Gumbel-Softmax symbols: hard or soft."""
     rounds: int = 1
@@ -311,9 +315,7 @@ class QLearningConfig(LearningConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _require(self.n_step >= 1, "algorithm.n_step must be at least 1 where there is no gae_lambda")
-        _between(
-            "algorithm", self, 1, 10_000_000, "replay_capacity", "batch_size", "sequence_length", "mixer_width"
-        )
+        _between("algorithm", self, 1, 10_000_000, "replay_capacity", "batch_size", "sequence_length")
         _between("algorithm", self, 0, 1_000_000_000, "learning_starts")
         _between("algorithm", self, 1, 1_000_000, "updates")
         _between("algorithm", self, 0.0, 1.0, "target_step")
@@ -342,11 +344,48 @@ class QmixConfig(QLearningConfig):
         _between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end")
 
 
-AlgorithmConfig: TypeAlias = GacrlPaperConfig | MappoConfig | IppoConfig | QmixConfig
+@dataclass(frozen=True)
+class GacrlConfig(QLearningConfig):
+    """GACRL that solves the task: the paper's four ideas on a learner that uses them (docs/algorithm.md)."""
+
+    name: ClassVar[str] = "gacrl"
+
+    critic: Literal["central", "sum"] = "central"
+    """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""
+    latent_weight: float = 1e-3
+    """Weight of the code's loss: reconstruction and KL divergence."""
+    exploration: Literal["adaptive", "linear", "fixed"] = "adaptive"
+    """The level of exploration follows the coverage that greedy episodes reach, or time, or stays at its end."""
+    epsilon: float = 1.0
+    """Share of random actions while nothing is covered."""
+    epsilon_end: float = 0.05
+    """And when everything is."""
+    temperature: float = 2.0
+    """Gumbel-Softmax temperature of the symbols while nothing is covered."""
+    temperature_end: float = 0.5
+    """And when everything is."""
+    exploration_steps: int = 12_000
+    """Environment steps over which the levels fall, where they follow time."""
+    greedy_share: float = 0.2
+    """Share of the training episodes that are played greedily, to see what is covered without exploring."""
+    coverage_radius: Literal["0.1", "0.2", "0.5"] = "0.2"
+    """Radius of the coverage that exploration follows."""
+    averaged: bool = True
+    """Play greedily with the target network, a running mean of the parameters."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _between("algorithm", self, 0.0, 1e6, "latent_weight")
+        _between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
+        _between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
+        _between("algorithm", self, 1, 1_000_000_000, "exploration_steps")
+
+
+AlgorithmConfig: TypeAlias = GacrlPaperConfig | GacrlConfig | MappoConfig | IppoConfig | QmixConfig
 """Any algorithm's settings."""
 
 ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType(
-    {kind.name: kind for kind in (GacrlPaperConfig, MappoConfig, IppoConfig, QmixConfig)}
+    {kind.name: kind for kind in (GacrlPaperConfig, GacrlConfig, MappoConfig, IppoConfig, QmixConfig)}
 )
 
 
@@ -449,29 +488,64 @@ def _baseline(name: str, algorithm: AlgorithmConfig, training: TrainingConfig) -
     )
 
 
-_ON_POLICY = TrainingConfig(env_steps=3_000_000, num_envs=128, num_steps=25)
-_OFF_POLICY = TrainingConfig(env_steps=2_000_000, num_envs=32, num_steps=8)
-_MAPPO = _baseline("mappo", MappoConfig(learning_rate=2e-3, network=NetworkConfig(width=64)), _ON_POLICY)
-_IPPO = _baseline("ippo", IppoConfig(learning_rate=2e-3, network=NetworkConfig(width=64)), _ON_POLICY)
-_QMIX = _baseline("qmix", QmixConfig(n_step=3), _OFF_POLICY)
-_VDN = _baseline("vdn", QmixConfig(n_step=3, mixer="vdn"), _OFF_POLICY)
-_IQL = _baseline("iql", QmixConfig(n_step=3, mixer="iql"), _OFF_POLICY)
-_COMMNET = _baseline(
-    "commnet", IppoConfig(learning_rate=2e-3, network=NetworkConfig(communication="commnet", rounds=2)), _ON_POLICY
-)
-_DIAL = _baseline(
-    "dial",
-    QmixConfig(
+def _ppo(kind: type[PpoConfig], **network: Any) -> Any:
+    """The tuned PPO of docs/results.md."""
+    return kind(
+        network=NetworkConfig(width=64, **network),
+        learning_rate=3e-3,
+        gamma=0.9,
+        gae_lambda=0.8,
+        clip_eps=0.3,
+        ent_coef=0.001,
+        num_minibatches=4,
+        reward="own",
+    )
+
+
+def _q(mixer: Literal["qmix", "vdn", "iql"], sequence_length: int = 1, **network: Any) -> QmixConfig:
+    """The tuned Q-learning of docs/results.md."""
+    return QmixConfig(
+        network=NetworkConfig(**network),
+        mixer=mixer,
         n_step=3,
-        mixer="vdn",
-        sequence_length=8,
-        network=NetworkConfig(communication="dial", recurrent=True, width=64),
+        updates=16,
+        reward_norm=True,
+        max_grad_norm=1.0,
+        sequence_length=sequence_length,
+    )
+
+
+_ON_POLICY = TrainingConfig(env_steps=2_500_000, num_envs=64, num_steps=25)
+_OFF_POLICY = TrainingConfig(env_steps=1_000_000, num_envs=32, num_steps=8)
+_MAPPO = _baseline("mappo", _ppo(MappoConfig), _ON_POLICY)
+_IPPO = _baseline("ippo", _ppo(IppoConfig), _ON_POLICY)
+_QMIX = _baseline("qmix", _q("qmix"), _OFF_POLICY)
+_VDN = _baseline("vdn", _q("vdn"), _OFF_POLICY)
+_IQL = _baseline("iql", _q("iql"), _OFF_POLICY)
+_COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds=2), _ON_POLICY)
+_DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
+
+_GACRL_NETWORK = NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete")
+_GACRL_112K = RunConfig(
+    algorithm=GacrlConfig(
+        network=_GACRL_NETWORK,
+        learning_rate=2e-3,
+        learning_rate_end=1e-4,
+        n_step=3,
+        augment=True,
+        replay_capacity=120_000,
+        learning_starts=500,
+        updates=10,
     ),
-    _OFF_POLICY,
+    env=EnvConfig(max_cycles=75),
+    training=TrainingConfig(env_steps=112_500, num_envs=5, num_steps=5),
+    evaluation=EvaluationConfig(interval=7_500),
+    preset="gacrl-112k",
 )
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
+        "gacrl-112k": ("GACRL that solves the task, on the paper's budget of 112,500 steps", _GACRL_112K),
         "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
         "vdn": ("VDN: the same learner, values summed", _VDN),
         "iql": ("IQL: the same learner, each agent for itself", _IQL),

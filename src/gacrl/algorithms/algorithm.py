@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from gacrl.config import (
     AlgorithmConfig,
+    GacrlConfig,
     GacrlPaperConfig,
     IppoConfig,
     MappoConfig,
@@ -38,10 +39,11 @@ def make(config: AlgorithmConfig, env: Environment, training: TrainingConfig) ->
 
     training: its planned length is what schedules run over; how experience is gathered shapes a replay.
     """
-    from gacrl.algorithms import gacrl_paper, ippo, mappo, qmix
+    from gacrl.algorithms import gacrl, gacrl_paper, ippo, mappo, qmix
 
     builders: dict[type[AlgorithmConfig], Callable[[Any, Environment, TrainingConfig], Algorithm]] = {
         GacrlPaperConfig: gacrl_paper.make,
+        GacrlConfig: gacrl.make,
         MappoConfig: mappo.make,
         IppoConfig: ippo.make,
         QmixConfig: qmix.make,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -107,11 +108,12 @@ class Exploration(NamedTuple):
     """(what the episode carries, key, ε) -> (the same, settled; the ε of this episode)."""
 
 
-def linear(start: float, end: float, steps: int, temperature: float = 1.0) -> Exploration:
-    """ε falls linearly over the environment steps, whatever happens; one temperature."""
+def linear(epsilon: tuple[float, float], steps: int, temperature: tuple[float, float] = (1.0, 1.0)) -> Exploration:
+    """ε and τ fall linearly over the environment steps, whatever happens."""
 
     def level(state: Any, env_steps: Int[Array, ""]) -> Level:
-        return Level(progress_between(start, end, env_steps / max(steps, 1)), jnp.asarray(temperature))
+        progress = env_steps / max(steps, 1)
+        return Level(progress_between(*epsilon, progress), progress_between(*temperature, progress))
 
     return Exploration(
         init=lambda: (),
@@ -120,3 +122,52 @@ def linear(start: float, end: float, steps: int, temperature: float = 1.0) -> Ex
         initial_memory=(),
         begin=lambda mode, key, epsilon: (mode, epsilon),
     )
+
+
+class Follower(NamedTuple):
+    """What adaptive exploration knows: how much greedy episodes covered at their end, a running mean."""
+
+    coverage: Float[Array, ""]
+
+
+UNSETTLED, EXPLORING, GREEDY = range(3)
+"""What an episode is: settled by its first step."""
+
+
+def adaptive(
+    epsilon: tuple[float, float],
+    temperature: tuple[float, float],
+    greedy_share: float,
+    measure: str,
+    memory: float = 0.05,
+) -> Exploration:
+    """ε and τ follow coverage c: end + (start − end) (1 − c)², with c from episodes that do not explore.
+
+    The paper's (13) to (16) without the clock, and with a signal that exploration itself does not depress: a
+    share of the training episodes is played greedily (their steps count as any others), and c is the running
+    mean of what they cover at their last step.
+
+    measure: the name of the coverage among the task's measurements; a task that does not measure it is explored
+    as if nothing were covered.
+    """
+
+    def level(state: Follower, env_steps: Int[Array, ""]) -> Level:
+        missing = jnp.square(1.0 - state.coverage)
+        return Level(*(end + (start - end) * missing for start, end in (epsilon, temperature)))
+
+    def follow(state: Follower, steps: Transition) -> Follower:
+        if measure not in steps.info:
+            return state
+        ended = (steps.terminated | steps.truncated) & (steps.decision.extras["mode"] == GREEDY)
+        covered = jnp.where(ended, steps.info[measure], 0.0).sum() / jnp.maximum(ended.sum(), 1)
+        weight = 1.0 - (1.0 - memory) ** ended.sum()
+        return Follower(state.coverage + weight * (covered - state.coverage))
+
+    def begin(
+        mode: Int[Array, ""], key: PRNGKey, epsilon: Float[Array, ""]
+    ) -> tuple[Int[Array, ""], Float[Array, ""]]:
+        drawn = jnp.where(jax.random.bernoulli(key, greedy_share), GREEDY, EXPLORING)
+        mode = jnp.where(mode == UNSETTLED, drawn, mode)
+        return mode, jnp.where(mode == GREEDY, 0.0, epsilon)
+
+    return Exploration(lambda: Follower(jnp.zeros(())), level, follow, jnp.asarray(UNSETTLED), begin)

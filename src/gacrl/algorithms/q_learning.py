@@ -37,8 +37,8 @@ class Network(eqx.Module):
     team: Any
 
 
-TeamValue = Callable[[Network, Float[Array, "N A"], Int[Array, " N"], Observation], Float[Array, " M"]]
-"""(network, the head's numbers, actions, observation) -> what is learned: the team's value, or each agent's."""
+TeamValue = Callable[[Network, AgentOutput, Int[Array, " N"], Observation], Float[Array, " M"]]
+"""(network, its output, actions, observation) -> what is learned: the team's value, or each agent's."""
 
 
 class Parts(NamedTuple):
@@ -173,7 +173,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
             else:
                 action = greedy(output.head, observation.action_mask)
             best = greedy(output.head, observation.action_mask)
-            value = parts.team_value(network, output.head, best, observation).mean()
+            value = parts.team_value(network, output, best, observation).mean()
             extras = {"value": jnp.broadcast_to(value, action.shape), "memory": remembered.network, "mode": mode}
             decision = Decision(action, output.message, output.adjacency, extras)
             return decision, ActMemory(after, mode) if isinstance(memory, ActMemory) else ()
@@ -191,9 +191,9 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         network: Network, target: Network, observation: Observation, memory: Memory, target_memory: Memory
     ) -> Float[Array, " M"]:
         """The target network's value of the actions that are best: by the online network with double Q."""
-        theirs = target.agent(observation, target_memory)[0].head
-        chooser = network.agent(observation, memory)[0].head if config.double_q else theirs
-        return parts.team_value(target, theirs, greedy(chooser, observation.action_mask), observation)
+        theirs = target.agent(observation, target_memory)[0]
+        chooser = network.agent(observation, memory)[0] if config.double_q else theirs
+        return parts.team_value(target, theirs, greedy(chooser.head, observation.action_mask), observation)
 
     def one_window(
         network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
@@ -211,7 +211,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
             _, target_memories = outputs(target, seen, memory, None, temperature)
             online = jax.tree.map(lambda leaf: leaf[:learned], online)
         value = jax.vmap(lambda *now: parts.team_value(network, *now))(
-            online.head, now.decision.action, now.observation
+            online, now.decision.action, now.observation
         )
 
         weight, last = n_step_window(seen.terminated | seen.truncated, config.n_step)

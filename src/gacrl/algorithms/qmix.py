@@ -13,31 +13,31 @@ from gacrl.algorithms.q_learning import Network, Parts
 from gacrl.algorithms.shared import taken
 from gacrl.config import QmixConfig, TrainingConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.agent import AgentNetwork, matched
+from gacrl.networks.agent import AgentNetwork, AgentOutput, matched
 from gacrl.networks.critic import global_state
 from gacrl.networks.mixer import MonotonicMixer
 from gacrl.types import Observation, PRNGKey
 
 
 def independent(
-    network: Network, values: Float[Array, "N A"], action: Int[Array, " N"], observation: Observation
+    network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, " N"]:
     """IQL: each agent's value is learned from the reward by itself."""
-    return taken(values, action)
+    return taken(output.head, action)
 
 
 def summed(
-    network: Network, values: Float[Array, "N A"], action: Int[Array, " N"], observation: Observation
+    network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, "1"]:
     """VDN: Q_tot = Σ_i Q_i over the real agents."""
-    return jnp.where(observation.agent_mask, taken(values, action), 0.0).sum(keepdims=True)
+    return jnp.where(observation.agent_mask, taken(output.head, action), 0.0).sum(keepdims=True)
 
 
 def monotonic(
-    network: Network, values: Float[Array, "N A"], action: Int[Array, " N"], observation: Observation
+    network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, "1"]:
     """QMIX: Q_tot rises with every Q_i; how much, the state tells."""
-    return network.team(taken(values, action), global_state(observation), observation.agent_mask)[None]
+    return network.team(taken(output.head, action), global_state(observation), observation.agent_mask)[None]
 
 
 MIXERS = {"iql": independent, "vdn": summed, "qmix": monotonic}
@@ -58,7 +58,7 @@ def make(config: QmixConfig, env: Environment, training: TrainingConfig) -> Algo
     parts = Parts(
         networks=networks,
         team_value=MIXERS[config.mixer],
-        exploration=exploration.linear(config.epsilon, config.epsilon_end, config.epsilon_steps),
+        exploration=exploration.linear((config.epsilon, config.epsilon_end), config.epsilon_steps),
         auxiliary=lambda output: {},
     )
     return q_learning.make(config, env, training, parts)

@@ -104,11 +104,16 @@ def _references(config: RunConfig, episode: int, task: Mapping[str, float]) -> l
     """What random, noop and oracle get at the difficulty of that episode, over many episodes."""
     rows: list[Row] = []
     for name in scripted.SCRIPTED:
-        metrics = _play_scripted(name, config, task["local_ratio"], task["coverage_threshold"])
+        metrics = reference_episodes(name, config, task)
         mean = {metric: float(values.mean()) for metric, values in metrics.items()}
         sd = {metric: float(values.std()) for metric, values in metrics.items()}
         rows.append(Row(episode, name, mean, sd))
     return rows
+
+
+def reference_episodes(name: str, config: RunConfig, task: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Every metric of the episodes [E] of a scripted policy, at the difficulty of a row of `metrics.jsonl`."""
+    return _play_scripted(name, config, task["local_ratio"], task["coverage_threshold"])
 
 
 def _play_scripted(name: str, config: RunConfig, local_ratio: float, threshold: float) -> dict[str, np.ndarray]:

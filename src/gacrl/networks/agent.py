@@ -16,6 +16,7 @@ from gacrl.envs.environment import Environment
 from gacrl.networks import communication
 from gacrl.networks import torso as torsos
 from gacrl.networks.communication import Communication, Neighbourhood
+from gacrl.networks.encoder import Code
 from gacrl.networks.graph import observed_adjacency
 from gacrl.networks.layers import Linear, num_parameters
 from gacrl.types import Channel, Memory, Observation, PRNGKey
@@ -35,12 +36,15 @@ class AgentOutput(NamedTuple):
     adjacency: Bool[Array, "N N"]
     entropy: Float[Array, " N"] | float
     """Of the symbols sent, nats; 0 without symbols."""
+    code_loss: Float[Array, " N"] | float
+    """Negative evidence lower bound of the code, up to constants; 0 without a code."""
 
 
 class AgentNetwork(eqx.Module):
     """Shared by all agents; for one environment at one step."""
 
     torso: torsos.Torso
+    code: Code | None
     memory: eqx.nn.GRUCell | None
     communication: Communication
     head: Linear
@@ -56,8 +60,9 @@ class AgentNetwork(eqx.Module):
         head_gain: float | None = None,
     ):
         """gain, head_gain: orthogonal initialisation, where they are given."""
-        torso_key, memory_key, communication_key, head_key = jax.random.split(key, 4)
+        torso_key, code_key, memory_key, communication_key, head_key = jax.random.split(key, 5)
         self.torso = torsos.make(env, config, torso_key, gain)
+        self.code = None if config.latent == "none" else Code(config, code_key)
         self.memory = eqx.nn.GRUCell(config.width, config.width, key=memory_key) if config.recurrent else None
         self.communication = communication.make(config, communication_key, gain)
         self.head = Linear(config.width, num_outputs, head_key, head_gain)
@@ -85,12 +90,17 @@ class AgentNetwork(eqx.Module):
         near = Neighbourhood(adjacency, _offsets(observation))
         remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
         hidden = self.torso(observation)
+        code, code_loss = None, 0.0
+        if self.code is not None:
+            code, hidden, code_loss = self.code(hidden, None if key is None else jax.random.fold_in(key, 2_000))
         hidden = self.communication.hear(hidden, remembered.inbox, near, channel, key)
         carry = remembered.carry
         if self.memory is not None:
             carry = hidden = jax.vmap(self.memory)(hidden, carry)
-        spoken = self.communication.speak(hidden, near, channel, key, temperature)
-        output = AgentOutput(self.head(spoken.hidden), spoken.hidden, spoken.message, adjacency, spoken.entropy)
+        spoken = self.communication.speak(hidden, near, channel, key, temperature, code)
+        output = AgentOutput(
+            self.head(spoken.hidden), spoken.hidden, spoken.message, adjacency, spoken.entropy, code_loss
+        )
         if not isinstance(memory, AgentMemory):
             return output, ()
         return output, AgentMemory(carry, spoken.inbox)

@@ -52,6 +52,7 @@ class Silence(eqx.Module):
         channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
+        code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         return Spoken(hidden, None, ())
 
@@ -75,6 +76,7 @@ class CommNet(Silence):
         channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
+        code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         message = hidden
         for own, heard in zip(self.own, self.heard, strict=True):
@@ -114,6 +116,7 @@ class Dial(Silence):
         channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
+        code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         message = discretise_regularise(self.encode(hidden), key, self.noise)
         return Spoken(hidden, message, message)
@@ -122,8 +125,9 @@ class Dial(Silence):
 class Symbols(Silence):
     """Rounds of discrete messages: one symbol for each agent and round, straight-through Gumbel-Softmax.
 
-    A receiver knows where the speaker stands: an edge's embedding is of the symbol and the offset. Over the
-    neighbours: attention by the receiver, and the mean with it.
+    The first round's symbol is made of the agent's code, where it has one, as the paper's is of its latent; those
+    of later rounds of what it knows by then. A receiver knows where the speaker stands: an edge's embedding is of
+    the symbol and the offset. Over the neighbours: the mean, weighted by the receiver's attention.
     """
 
     encode: tuple[Linear, ...]
@@ -135,7 +139,9 @@ class Symbols(Silence):
     def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, narrow, symbols = config.width, config.width // 2, config.vocabulary
         encode, edge, attention, merge = jax.random.split(key, (4, config.rounds))
-        self.encode = tuple(Linear(width, symbols, k, gain) for k in encode)
+        first = width if config.latent == "none" else config.latent_size
+        sizes = (first, *[width] * (config.rounds - 1))
+        self.encode = tuple(Linear(i, symbols, k, gain) for i, k in zip(sizes, encode, strict=True))
         self.edge = tuple(Mlp(symbols + 3, (narrow,), k, gain) for k in edge)
         self.attention = tuple(Linear(width + narrow, 1, k, gain) for k in attention)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
@@ -148,6 +154,7 @@ class Symbols(Silence):
         channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
+        code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         length = jnp.sqrt(jnp.square(near.offsets).sum(-1, keepdims=True) + 1e-8)
         where = jnp.concatenate([near.offsets, length], axis=-1)
@@ -155,7 +162,7 @@ class Symbols(Silence):
         for number, (encode, edge, attention, merge) in enumerate(
             zip(self.encode, self.edge, self.attention, self.merge, strict=True)
         ):
-            logits = encode(hidden)
+            logits = encode(hidden if code is None or number else code)
             log_symbol = jax.nn.log_softmax(logits)
             entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / len(self.encode)
             if key is None:

@@ -1,4 +1,4 @@
-"""The latent encoder: a Gaussian over z for each agent's observation (a VAE without its decoder)."""
+"""Latent codes: the paper's encoder (a VAE without its decoder), and a code of any torso's vector, with one."""
 
 from typing import Literal
 
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from gacrl.config import NetworkConfig
 from gacrl.networks.layers import Linear
 from gacrl.types import PRNGKey
 
@@ -47,3 +48,38 @@ def kl_divergence(
 ) -> Float[Array, "..."]:
     """KL(N(μ, σ²) ‖ N(0, I)), summed over the axis of the latent dimensions."""
     return -0.5 * (1 + log_variance - jnp.square(mean) - jnp.exp(log_variance)).sum(axis)
+
+
+class Code(eqx.Module):
+    """A code z of each agent's vector h: Gaussian, learned with its evidence lower bound, or deterministic.
+
+    Reconstructed is h itself, which holds for any number of entities; h takes no gradient from that.
+    """
+
+    encode: Linear
+    decode: Linear
+    merge: Linear
+    gaussian: bool = eqx.field(static=True)
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey):
+        encode_key, decode_key, merge_key = jax.random.split(key, 3)
+        self.gaussian = config.latent == "vae"
+        size = config.latent_size
+        self.encode = Linear(config.width, 2 * size if self.gaussian else size, encode_key)
+        self.decode = Linear(size, config.width, decode_key)
+        self.merge = Linear(size, config.width, merge_key)
+
+    def __call__(
+        self, hidden: Float[Array, "N H"], key: PRNGKey | None
+    ) -> tuple[Float[Array, "N Z"], Float[Array, "N H"], Float[Array, " N"]]:
+        """Returns z, the vector that knows of it, and the code's loss. Without a key z is the mean."""
+        divergence = 0.0
+        if self.gaussian:
+            mean, log_variance = jnp.split(self.encode(hidden), 2, axis=-1)
+            noise = 0.0 if key is None else jax.random.normal(key, mean.shape)
+            code = sample_latent(mean, log_variance, noise * jnp.ones_like(mean))
+            divergence = kl_divergence(mean, log_variance)
+        else:
+            code = self.encode(hidden)
+        error = jnp.square(self.decode(code) - jax.lax.stop_gradient(hidden)).sum(-1)
+        return code, hidden + jax.nn.relu(self.merge(code)), 0.5 * error + divergence

@@ -19,8 +19,8 @@ class ProbeResult(NamedTuple):
     returns: dict[str, float]
     """Greedy return of each probe."""
     values: dict[str, tuple[float, float]]
-    """The critic's value of an episode's first observation, where the sign is −1 and where it is 1; NaN for
-    algorithms whose decisions hold no value."""
+    """The value that the first agent's decision holds at an episode's first observation, where the sign is −1 and
+    where it is 1; NaN for algorithms whose decisions hold no value."""
 
 
 def probe_algorithm(
@@ -60,6 +60,7 @@ def _values(trainer: Trainer, env: Probe, learner: Learner, params: ProbeParams)
         seen = env.observe(state._replace(sign=jnp.asarray(sign)), params)
         decision, _ = policy(trainer.memory, seen, jax.random.key(0), Channel())
         extras = decision.extras
-        return extras["value"] if isinstance(extras, dict) and "value" in extras else jnp.asarray(np.nan)
+        known = extras["value"] if isinstance(extras, dict) and "value" in extras else jnp.asarray(np.nan)
+        return jnp.ravel(known)[0]
 
     return jnp.stack([value(-1.0), value(1.0)])

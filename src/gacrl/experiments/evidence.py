@@ -1,0 +1,156 @@
+"""What the runs of a reproduction showed, as plain arrays: all that verdicts, tables and figures are made from.
+
+S seeds, K stretches of training (the episodes between two lines of the log), E episodes of a scripted policy.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gacrl.config import RunConfig
+from gacrl.envs.scripted import SCRIPTED
+from gacrl.experiments.paper_tables import reference_episodes
+from gacrl.training.recorder import RunFolder
+
+Play = Literal["training", "sampled", "greedy"]
+"""The end of training, exploration and all; the closing evaluation sampled as in training; and greedy."""
+Metrics = Mapping[str, Float[np.ndarray, "..."]]
+
+FINAL_EPISODES = 50
+"""What the paper's final metrics cover, and what a random policy is averaged over beside them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One algorithm's training, and the evaluation that closed it."""
+
+    config: RunConfig
+    episodes: Int[np.ndarray, " K"]
+    """Finished at the end of each stretch."""
+    counted: Int[np.ndarray, " K"]
+    """Finished in each stretch."""
+    mean: Metrics
+    """[S, K] over a stretch's episodes; `sd` is their standard deviation, `last` the stretch's last episode."""
+    sd: Metrics
+    last: Metrics
+    tasks: tuple[Mapping[str, float], ...]
+    """The difficulty at the end of each stretch."""
+    final: Mapping[str, Metrics]
+    """[S] of the closing evaluation, greedy and sampled."""
+    seconds: float
+    """Of all seeds together, evaluations and compilation included."""
+
+    @property
+    def closing(self) -> tuple[Metrics, Metrics, int]:
+        """Mean and standard deviation [S] over the last stretches that hold `FINAL_EPISODES`, and how many."""
+        enough = np.cumsum(self.counted[::-1]) >= FINAL_EPISODES
+        take = (int(enough.argmax()) if enough.any() else len(enough) - 1) + 1
+        weight = self.counted[-take:] / self.counted[-take:].sum()
+        mean = {name: values[:, -take:] @ weight for name, values in self.mean.items()}
+        sd = {
+            name: np.sqrt(
+                np.maximum((self.sd[name][:, -take:] ** 2 + values[:, -take:] ** 2) @ weight - mean[name] ** 2, 0.0)
+            )
+            for name, values in self.mean.items()
+        }
+        return mean, sd, int(self.counted[-take:].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Episodes [E] of a scripted policy: at the difficulty of each stretch of GACRL's, and as evaluated."""
+
+    stretches: tuple[Metrics, ...]
+    final: Metrics
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Everything, under (column, who): trained algorithms in `series`, scripted policies in `references`."""
+
+    series: Mapping[tuple[str, str], Series]
+    references: Mapping[tuple[str, str], Reference]
+
+    def values(self, weights: Mapping[str, float], who: str, play: Play, column: str) -> Float[np.ndarray, " S"]:
+        """A measure (a weighted sum of metrics) at the end: one number a seed.
+
+        A scripted policy has no seeds: its numbers are means over blocks of `FINAL_EPISODES` episodes.
+        """
+        if (column, who) in self.series:
+            series = self.series[column, who]
+            return measured(weights, series.closing[0] if play == "training" else series.final[play])
+        reference = self.references[column, who]
+        return blocks(measured(weights, reference.stretches[-1] if play == "training" else reference.final))
+
+
+def measured(weights: Mapping[str, float], metrics: Metrics) -> Float[np.ndarray, "..."]:
+    """The weighted sum of the metrics."""
+    return np.sum([weight * metrics[name] for name, weight in weights.items()], axis=0)
+
+
+def blocks(episodes: Float[np.ndarray, " E"], size: int = FINAL_EPISODES) -> Float[np.ndarray, " blocks"]:
+    """Means of blocks of episodes; at least two blocks, however few episodes there are."""
+    count = max(len(episodes) // size, 2)
+    size = min(size, len(episodes) // count)
+    return episodes[: count * size].reshape(count, size).mean(1)
+
+
+def read_series(path: Path) -> Series:
+    """A finished run folder."""
+    folder = RunFolder.open(path)
+    config, rows, summary = folder.config(), folder.metrics(), folder.summary()
+    by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
+    ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
+    kept = np.flatnonzero(ended.min(0) > 0)
+    names = list(rows[0]["train"]["mean"])
+
+    def stacked(what: str) -> dict[str, np.ndarray]:
+        return {name: np.array([[seen[k]["train"][what][name] for k in kept] for seen in by_seed]) for name in names}
+
+    return Series(
+        config=config,
+        episodes=np.array([by_seed[0][k]["episodes_done"] for k in kept]),
+        counted=ended[0][kept],
+        mean=stacked("mean"),
+        sd=stacked("sd"),
+        last=stacked("last_episode"),
+        tasks=tuple(by_seed[0][k]["task"] for k in kept),
+        final={kind: _final(summary["final"][kind]) for kind in ("greedy", "sampled")},
+        seconds=float(summary["wall_seconds"]),
+    )
+
+
+def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    return {name: np.array(entry["values"]) for name, entry in metrics.items() if not name.startswith("score_")}
+
+
+def gather(folders: Mapping[tuple[str, str], Path]) -> Evidence:
+    """The evidence of finished run folders, with the scripted policies played at the difficulty of GACRL's rows."""
+    series = {key: read_series(path) for key, path in folders.items()}
+    references = {
+        (column, name): _play(name, followed)
+        for (column, who), followed in series.items()
+        if who == "GACRL"
+        for name in SCRIPTED
+    }
+    return Evidence(series, references)
+
+
+def _play(name: str, followed: Series) -> Reference:
+    """A scripted policy beside a series; a difficulty that stays the same is played once."""
+    played: dict[tuple[float, float], dict[str, np.ndarray]] = {}
+
+    def at(task: Mapping[str, float]) -> dict[str, np.ndarray]:
+        key = (task["local_ratio"], task["coverage_threshold"])
+        if key not in played:
+            episodes = reference_episodes(name, followed.config, task)
+            played[key] = {metric: np.asarray(values, float) for metric, values in episodes.items()}
+        return played[key]
+
+    env = followed.config.env
+    configured = {"local_ratio": env.local_ratio, "coverage_threshold": env.coverage_threshold}
+    return Reference(tuple(at(task) for task in followed.tasks), at(configured))

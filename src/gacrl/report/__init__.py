@@ -1,0 +1,1 @@
+"""Pages to read and their figures, from numbers that are there already."""
