@@ -16,7 +16,7 @@ PACKAGE = Path(gacrl.__file__).parent
 
 LAYERS = (
     ("errors", "types", "config"),
-    ("arguments", "envs", "networks"),
+    ("arguments", "envs", "networks", "report"),
     ("algorithms",),
     ("rollout",),
     ("evaluation", "render"),
@@ -125,6 +125,22 @@ print("commands", "jax" in loaded())
     assert lines[0] == "gacrl [] "
     assert "cli False" in lines
     assert lines[-1] == "commands False"
+
+
+def test_reports_stand_on_leaves():
+    """A page and its figures are made from numbers alone."""
+    imported = {room for path in (PACKAGE / "report").glob("*.py") for _, room in rooms_imported(path.read_text())}
+    assert imported <= {"errors", "config", "report"}
+
+
+def test_statistics_and_reports_start_without_jax():
+    code = """
+import sys
+import gacrl.evaluation.statistics, gacrl.report.page
+print("jax" in sys.modules, "matplotlib" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.split() == ["False", "False"]
 
 
 def test_public_names_exist_and_say_what_they_are():

@@ -319,7 +319,8 @@ def _picks(seeds: int, tasks: int, reps: int, rng: np.random.Generator) -> NDArr
 
 def _resample(scores: Floats, reps: int, rng: np.random.Generator) -> Floats:
     """Scores [S, K] with the seeds of each task drawn again: [R, S, K]."""
-    return np.take_along_axis(scores[None], _picks(*scores.shape, reps, rng), axis=1)
+    picks = _picks(scores.shape[0], scores.shape[1], reps, rng)
+    return np.take_along_axis(scores[None], picks, axis=1)
 
 
 def _interval(resampled: Floats) -> tuple[float, float]:
