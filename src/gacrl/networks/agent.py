@@ -17,7 +17,7 @@ from gacrl.networks import communication
 from gacrl.networks import torso as torsos
 from gacrl.networks.communication import Communication, Neighbourhood
 from gacrl.networks.encoder import Code
-from gacrl.networks.graph import observed_adjacency
+from gacrl.networks.graph import audible, observed_adjacency
 from gacrl.networks.layers import Linear, num_parameters
 from gacrl.types import Channel, Memory, Observation, PRNGKey
 
@@ -87,7 +87,7 @@ class AgentNetwork(eqx.Module):
         """Without a key nothing is drawn: the most likely symbols, DIAL's bits."""
         channel = Channel() if channel is None else channel
         adjacency = observed_adjacency(observation, self.radius)
-        near = Neighbourhood(adjacency, _offsets(observation))
+        near = Neighbourhood(audible(adjacency, channel), _offsets(observation))
         remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
         hidden = self.torso(observation)
         code, code_loss = None, 0.0
@@ -98,8 +98,11 @@ class AgentNetwork(eqx.Module):
         if self.memory is not None:
             carry = hidden = jax.vmap(self.memory)(hidden, carry)
         spoken = self.communication.speak(hidden, near, channel, key, temperature, code)
+        message = (
+            None if spoken.message is None else jnp.where(observation.agent_mask[:, None], spoken.message, 0.0)
+        )
         output = AgentOutput(
-            self.head(spoken.hidden), spoken.hidden, spoken.message, adjacency, spoken.entropy, code_loss
+            self.head(spoken.hidden), spoken.hidden, message, adjacency, spoken.entropy, code_loss
         )
         if not isinstance(memory, AgentMemory):
             return output, ()

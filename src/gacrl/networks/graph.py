@@ -25,6 +25,11 @@ def observed_adjacency(observation: Observation, radius: Float[Array, ""] | floa
     return mask[:, None] & mask[None, :] & ~jnp.eye(mask.shape[0], dtype=bool)
 
 
+def audible(adjacency: Bool[Array, "N N"], channel: Channel) -> Bool[Array, "N N"]:
+    """The edges that the channel does not cut: to be silenced is not to be heard, also by attention and in means."""
+    return adjacency if channel.edge_keep is None else adjacency & (channel.edge_keep > 0)
+
+
 def neighbour_sum(
     messages: Float[Array, "V N"], adjacency: Bool[Array, "N N"], channel: Channel
 ) -> Float[Array, "V N"]:
