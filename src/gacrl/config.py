@@ -444,7 +444,7 @@ class RunConfig:
         _between("run", self, 0, 2**31 - 1, "seed")
         _between("run", self, 1, 10_000, "num_seeds")
         _require(
-            not self.env.continuous_actions,
+            not (self.env.continuous_actions and self.algorithm.name == GacrlPaperConfig.name),
             f"{self.algorithm.name} needs discrete actions: leave env.continuous_actions at False",
         )
 

@@ -8,11 +8,14 @@
 - Exploration that adapts to coverage (13) to (16): `exploration.adaptive`.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import exploration, q_learning
+from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.exploration import Exploration
 from gacrl.algorithms.q_learning import Network, Parts
@@ -27,11 +30,15 @@ from gacrl.types import Metrics, Observation, PRNGKey
 
 
 def central(
-    network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
+    actions: ActionSet,
+    network: Network,
+    output: AgentOutput,
+    action: Int[Array, " N"],
+    observation: Observation,
 ) -> Float[Array, "1"]:
     """Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)]: the critic of (12), and what each agent falls short of it."""
     layers, head = network.team
-    available = jnp.where(observation.action_mask, output.head, -jnp.inf)
+    available = jnp.where(actions.mask(observation.action_mask), output.head, -jnp.inf)
     shortfall = taken(output.head, action) - available.max(-1)
     value = head(layers(team_mean(output.hidden, observation)))
     return value + jnp.where(observation.agent_mask, shortfall, 0.0).sum()
@@ -39,12 +46,13 @@ def central(
 
 def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Algorithm:
     """The learner for this task's shapes."""
-    settings = matched(env, config.network, env.num_actions)
+    actions = choices(env)
+    settings = matched(env, config.network, actions.size)
     width = settings.width
 
     def networks(key: PRNGKey) -> Network:
         agent_key, layers_key, head_key = jax.random.split(key, 3)
-        agent = AgentNetwork(env, settings, env.num_actions, agent_key)
+        agent = AgentNetwork(env, settings, actions.size, agent_key)
         if config.critic == "sum":
             return Network(agent, ())
         return Network(agent, (Mlp(width, (width,), layers_key), Linear(width, 1, head_key)))
@@ -56,7 +64,7 @@ def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Alg
 
     parts = Parts(
         networks=networks,
-        team_value=central if config.critic == "central" else summed,
+        team_value=partial(central, actions) if config.critic == "central" else summed,
         exploration=_exploration(config),
         auxiliary=auxiliary,
         averaged=config.averaged,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import turn_experience
 from gacrl.algorithms.exploration import progress_between
@@ -140,11 +141,12 @@ def evaluate_critic(
 
 
 def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: View) -> Algorithm:
-    """PPO for this task's shapes, with the critic's view. Needs discrete actions."""
+    """PPO for this task's shapes, with the critic's view."""
+    actions = choices(env)
     adam = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm), optax.flatten(optax.scale_by_adam(eps=1e-5))
     )
-    settings = matched(env, config.network, env.num_actions)
+    settings = matched(env, config.network, actions.size)
     per_update = training.num_envs * training.num_steps
     hyper = Hyper(
         learning_rate=config.learning_rate,
@@ -162,7 +164,7 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         actor_key, critic_key = jax.random.split(key)
         gain = 2**0.5
         return Network(
-            AgentNetwork(env, settings, env.num_actions, actor_key, gain, head_gain=0.01),
+            AgentNetwork(env, settings, actions.size, actor_key, gain, head_gain=0.01),
             Critic(env, settings, view, critic_key, gain),
         )
 
@@ -190,27 +192,33 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
             output, actor_memory = learner.network.actor(
                 observation, actor_memory, talk_key if explore else None, channel
             )
-            log_probs = log_policy(output.head, observation.action_mask)
-            action = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
+            log_probs = log_policy(output.head, actions.mask(observation.action_mask))
+            choice = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
             value, critic_memory = learner.network.critic(observation, critic_memory)
             extras = {
                 "value": learner.norm.denormalise(value),
-                "log_prob": taken(log_probs, action),
+                "choice": choice,
+                "log_prob": taken(log_probs, choice),
                 "key": talk_key,
             }
-            decision = Decision(action, output.message, output.adjacency, extras)
+            decision = Decision(actions.act(choice), output.message, output.adjacency, extras)
             return decision, PpoMemory(actor_memory, critic_memory) if memory else ()
 
         return act
 
     def experience_of(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> Transition:
-        """The rollout; turned by a symmetry for each environment, where that is asked for.
+        """The rollout, with choices for actions; turned by a symmetry for each environment, where that is asked for.
 
         What the acting policy thinks is then asked again, of the turned world.
         """
+        steps = rollout.transitions
+        steps = steps._replace(
+            observation=steps.observation._replace(action_mask=actions.mask(steps.observation.action_mask)),
+            decision=steps.decision._replace(action=steps.decision.extras["choice"]),
+        )
         if not config.augment:
-            return rollout.transitions
-        steps = turn_experience(env, rollout.transitions, key)
+            return steps
+        steps = turn_experience(env, steps, key)
         memory = split_memory(rollout.first_memory)
 
         def again(steps: Transition, memory: PpoMemory):
@@ -265,7 +273,7 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         sample = Sample(
             observation=steps.observation,
             first=steps.first,
-            action=steps.decision.action,  # pyright: ignore[reportArgumentType] discrete
+            action=steps.decision.action,  # pyright: ignore[reportArgumentType] they are indices now
             key=steps.decision.extras["key"],
             log_prob=steps.decision.extras["log_prob"],
             advantage=(advantage - centre) / (spread + 1e-8),

@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.algorithms import replay as ring
+from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import turn_experience
 from gacrl.algorithms.exploration import Exploration, progress_between
@@ -108,7 +109,8 @@ def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[
 
 
 def make(config: QLearningConfig, env: Environment, training: TrainingConfig, parts: Parts) -> Algorithm:
-    """The learner for this task's shapes. Needs discrete actions."""
+    """The learner for this task's shapes."""
+    actions = choices(env)
     clip = optax.clip_by_global_norm(config.max_grad_norm)
     adam = optax.flatten(optax.chain(clip, optax.scale_by_adam()))
     num_envs, num_steps = training.num_envs, training.num_steps
@@ -132,9 +134,9 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
     def example() -> Experience:
         """A step's shapes."""
         state, observation = env.reset(jax.random.key(0))
-        action = jnp.zeros(env.num_agents, jnp.int32)
-        after, false = env.step(state, action, jax.random.key(0))[1], jnp.zeros((), bool)
-        step = Transition(observation, Decision(action), after.reward, false, false, false, after.observation, {})
+        choice = jnp.zeros(env.num_agents, jnp.int32)
+        after, false = env.step(state, actions.act(choice), jax.random.key(0))[1], jnp.zeros((), bool)
+        step = Transition(observation, Decision(choice), after.reward, false, false, false, after.observation, {})
         return Experience(step, nothing_remembered)
 
     packed, unpack = ring.packing(
@@ -169,13 +171,18 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
             )
             if explore:
                 mode, epsilon = parts.exploration.begin(mode, mode_key, level.epsilon)
-                action = epsilon_greedy(action_key, output.head, observation.action_mask, epsilon)
+                choice = epsilon_greedy(action_key, output.head, actions.mask(observation.action_mask), epsilon)
             else:
-                action = greedy(output.head, observation.action_mask)
-            best = greedy(output.head, observation.action_mask)
+                choice = greedy(output.head, actions.mask(observation.action_mask))
+            best = greedy(output.head, actions.mask(observation.action_mask))
             value = parts.team_value(network, output, best, observation).mean()
-            extras = {"value": jnp.broadcast_to(value, action.shape), "memory": remembered.network, "mode": mode}
-            decision = Decision(action, output.message, output.adjacency, extras)
+            extras = {
+                "value": jnp.broadcast_to(value, choice.shape),
+                "choice": choice,
+                "memory": remembered.network,
+                "mode": mode,
+            }
+            decision = Decision(actions.act(choice), output.message, output.adjacency, extras)
             return decision, ActMemory(after, mode) if isinstance(memory, ActMemory) else ()
 
         return act
@@ -193,7 +200,9 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         """The target network's value of the actions that are best: by the online network with double Q."""
         theirs = target.agent(observation, target_memory)[0]
         chooser = network.agent(observation, memory)[0] if config.double_q else theirs
-        return parts.team_value(target, theirs, greedy(chooser.head, observation.action_mask), observation)
+        return parts.team_value(
+            target, theirs, greedy(chooser.head, actions.mask(observation.action_mask)), observation
+        )
 
     def one_window(
         network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
@@ -243,7 +252,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
     def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
         """Remember a rollout, then take the configured gradient steps."""
         steps = rollout.transitions
-        kept = steps._replace(decision=Decision(steps.decision.action), info={})
+        kept = steps._replace(decision=Decision(steps.decision.extras["choice"]), info={})
         block = Experience(kept, steps.decision.extras["memory"])
         replay = ring.add_block(learner.replay, jax.vmap(jax.vmap(ring.pack))(block))
         rewards = learner.rewards

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import exploration, q_learning
+from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.q_learning import Network, Parts
 from gacrl.algorithms.shared import taken
@@ -45,12 +46,13 @@ MIXERS = {"iql": independent, "vdn": summed, "qmix": monotonic}
 
 def make(config: QmixConfig, env: Environment, training: TrainingConfig) -> Algorithm:
     """Q-learning with the configured mixer."""
-    settings = matched(env, config.network, env.num_actions)
+    num_choices = choices(env).size
+    settings = matched(env, config.network, num_choices)
     state_size = jax.eval_shape(lambda: global_state(env.reset(jax.random.key(0))[1])).size
 
     def networks(key: PRNGKey) -> Network:
         agent_key, mixer_key = jax.random.split(key)
-        agent = AgentNetwork(env, settings, env.num_actions, agent_key)
+        agent = AgentNetwork(env, settings, num_choices, agent_key)
         if config.mixer != "qmix":
             return Network(agent, ())
         return Network(agent, MonotonicMixer(env.num_agents, state_size, config.mixer_width, mixer_key))

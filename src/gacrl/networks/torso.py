@@ -17,6 +17,11 @@ from gacrl.envs.environment import Environment, SpatialEnvironment
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.types import Entities, Observation, PRNGKey
 
+NEAR = 0.2
+"""Arena units within which an offset is also given magnified: an agent's push moves it this far."""
+SCALES = 5
+"""Numbers that an offset is given as."""
+
 
 class MlpTorso(eqx.Module):
     """Layers over the observation as one vector: tied to the number of entities, and to their order."""
@@ -52,9 +57,9 @@ class GraphTorso(eqx.Module):
         rival_key, landmark_key, agent_key, attention_key, out_key = jax.random.split(key, 5)
         width, narrow = config.width, config.width // 2
         own = env.own_size if isinstance(env, SpatialEnvironment) else env.observation_size
-        self.rival = Mlp(6, (narrow,), rival_key, gain)
-        self.landmark = Mlp(own + 3 + narrow, (width, width), landmark_key, gain)
-        self.agent = Mlp(own + 3, (narrow,), agent_key, gain)
+        self.rival = Mlp(2 * SCALES, (narrow,), rival_key, gain)
+        self.landmark = Mlp(own + SCALES + narrow, (width, width), landmark_key, gain)
+        self.agent = Mlp(own + SCALES, (narrow,), agent_key, gain)
         self.attention = Linear(width, 1, attention_key, gain)
         self.out = Mlp(own + 2 * width + narrow, (width,), out_key, gain)
         self.view = env.entities if isinstance(env, SpatialEnvironment) else _nothing_in_sight
@@ -67,19 +72,19 @@ class GraphTorso(eqx.Module):
         agents, agent_there = _nearest(seen.agents, self.nearest_agents)  # [N M 2]
 
         # Agent → landmark, in the agent's own frame: where each rival stands from each landmark, and where I do.
-        between = _with_length(agents[:, None, :, :] - landmarks[:, :, None, :])  # [N L M 3]
-        mine = jnp.broadcast_to(_with_length(-landmarks)[:, :, None, :], between.shape)
+        between = _scales(agents[:, None, :, :] - landmarks[:, :, None, :])  # [N L M 3]
+        mine = jnp.broadcast_to(_scales(-landmarks)[:, :, None, :], between.shape)
         rivals = self.rival(jnp.concatenate([between, mine], axis=-1))  # [N L M H/2]
         contest = _pool_max(rivals, agent_there[:, None, :], axis=2)
 
         # Landmark → agent, and agent → agent.
         places = self.landmark(
-            jnp.concatenate([_repeat(own, landmarks), _with_length(landmarks), contest], axis=-1)
+            jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1)
         )
         score = jnp.where(landmark_there, self.attention(places)[..., 0], -jnp.inf)
         chosen = _pool_softmax(places, score)
         best = _pool_max(places, landmark_there, axis=1)
-        others = self.agent(jnp.concatenate([_repeat(own, agents), _with_length(agents)], axis=-1))
+        others = self.agent(jnp.concatenate([_repeat(own, agents), _scales(agents)], axis=-1))
         crowd = _pool_max(others, agent_there, axis=1)
         return self.out(jnp.concatenate([own, chosen, best, crowd], axis=-1))
 
@@ -110,10 +115,10 @@ def _nearest(
     return offsets, squared > 0
 
 
-def _with_length(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
-    """The offset and its length; finite gradients at 0."""
+def _scales(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 5"]:
+    """The offset, its length, and the offset near by magnified; finite gradients at 0."""
     length = jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)
-    return jnp.concatenate([offsets, length], axis=-1)
+    return jnp.concatenate([offsets, length, jnp.tanh(offsets / NEAR)], axis=-1)
 
 
 def _repeat(own: Float[Array, "N K"], entities: Float[Array, "N M 2"]) -> Float[Array, "N M K"]:

@@ -1,0 +1,49 @@
+"""What agents choose among: the task's own actions, or where those are continuous a set of pushes.
+
+MPE2's continuous action is five pushes in [0, 1]. Full, half and quarter pushes in the four directions, and none,
+are a set with which an agent can stop anywhere; with full pushes alone it stops on a lattice of 0.2.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from gacrl.envs.environment import Environment, SpatialEnvironment
+
+STRENGTHS = (1.0, 0.5, 0.25)
+
+
+class ActionSet(NamedTuple):
+    """Choices by index."""
+
+    size: int
+    act: Callable[[Int[Array, " N"]], Array]
+    """What the task takes: [N] indices, or [N A] pushes."""
+    turn: Callable[[Int[Array, "*b"], Int[Array, ""]], Int[Array, "*b"]]
+    """The choices that do in a turned world what these do here."""
+    mask: Callable[[Bool[Array, "*b N A"]], Bool[Array, "*b N K"]]
+    """Which choices are available, from the task's mask of actions."""
+
+
+def choices(env: Environment) -> ActionSet:
+    """What the agents of this task choose among."""
+    spatial = env if isinstance(env, SpatialEnvironment) else None
+    if not env.continuous_actions:
+        turn = (lambda choice, symmetry: choice) if spatial is None else spatial.turn_action
+        return ActionSet(env.num_actions, lambda choice: choice, turn, lambda mask: mask)
+
+    table = np.concatenate([np.eye(env.num_actions)[:1], *[s * np.eye(env.num_actions)[1:] for s in STRENGTHS]])
+    if spatial is None:
+        becomes = np.arange(len(table))[None]
+    else:
+        turned = [np.asarray(spatial.turn_action(jnp.asarray(table), jnp.asarray(g))) for g in range(8)]
+        becomes = np.stack([np.abs(rows[:, None] - table).sum(-1).argmin(-1) for rows in turned])
+    return ActionSet(
+        size=len(table),
+        act=lambda choice: jnp.asarray(table, jnp.float32)[choice],
+        turn=lambda choice, symmetry: jnp.asarray(becomes)[symmetry][choice],
+        mask=lambda mask: jnp.ones((*mask.shape[:-1], len(table)), bool),
+    )
