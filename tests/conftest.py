@@ -5,11 +5,14 @@ import io
 import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import install_import_hook
@@ -48,6 +51,19 @@ def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
         yield environment
 
 
+def drawn(build: Any, *settings: Any, seed: int = 0) -> Any:
+    """`build(*settings, key)`, a network, with numbers drawn by NumPy: nothing is compiled to make one.
+
+    Networks with parameters of the same shapes get the same ones.
+    """
+    numbers = np.random.default_rng(seed)
+    shapes = eqx.filter_eval_shape(build, *settings, jax.random.key(0))
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(numbers.normal(0, max(leaf.shape[-1], 1) ** -0.5, leaf.shape), jnp.float32),
+        shapes,
+    )
+
+
 class TinyRun(NamedTuple):
     folder: Path
     words: list[str]
@@ -62,8 +78,6 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
 
     Tests that use it belong into the xdist group `runs`, so that it is trained once.
     """
-    import numpy as np
-
     from gacrl.cli import main
     from gacrl.experiments import paper_tables
 

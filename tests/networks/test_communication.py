@@ -1,0 +1,186 @@
+"""What reaches whom: CommNet and DIAL by hand, channels that silence, gradients from hearer to speaker."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import drawn
+
+from gacrl.config import NetworkConfig
+from gacrl.envs.probes import Probe
+from gacrl.envs.spread import Spread
+from gacrl.networks import communication
+from gacrl.networks.agent import AgentMemory, AgentNetwork, unroll
+from gacrl.networks.communication import Neighbourhood, discretise_regularise
+from gacrl.networks.graph import proximity_adjacency
+from gacrl.types import Channel
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+KINDS = ("commnet", "dial", "discrete", "soft")
+EVERYONE = jnp.ones((3, 3), bool) & ~jnp.eye(3, dtype=bool)
+
+
+def talk(kind: Any, **settings: Any) -> Any:
+    config = NetworkConfig(width=8, vocabulary=3, communication=kind, **settings)
+    return drawn(lambda key: communication.make(config, key))
+
+
+def sigmoid(x: Any) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.asarray(x, float)))
+
+
+# By hand.
+
+
+def test_commnet_by_hand():
+    """Two units; agent 0 hears 1 and 2, agent 1 hears 2, agent 2 nobody. H = [[1, 0], [0, 2]], C = [[0, 1], [1, 0]]."""
+    net = talk("commnet", rounds=1)
+    own, heard = net.own[0], net.heard[0]
+    own = eqx.tree_at(
+        lambda layer: (layer.weight, layer.bias), own, (jnp.diag(jnp.array([1.0, 2.0])), jnp.array([0.1, 0.0]))
+    )
+    heard = eqx.tree_at(lambda layer: (layer.weight, layer.bias), heard, (jnp.eye(2)[::-1], jnp.zeros(2)))
+    net = eqx.tree_at(lambda n: (n.own[0], n.heard[0]), net, (own, heard))
+    hidden = jnp.array([[0.0, 0.1], [0.2, 0.0], [0.4, 0.6]])
+    near = Neighbourhood(jnp.array([[0, 1, 1], [0, 0, 1], [0, 0, 0]], bool), jnp.zeros((3, 3, 2)))
+    spoken = net.speak(hidden, near, Channel(), None, 1.0)
+    # The mean of (0.2, 0) and (0.4, 0.6) is (0.3, 0.3); agent 1 hears (0.4, 0.6).
+    before = [[0.1 + 0.3, 0.2 + 0.3], [0.3 + 0.6, 0.0 + 0.4], [0.5, 1.2]]
+    np.testing.assert_allclose(spoken.hidden, np.tanh(before), rtol=1e-5)
+    np.testing.assert_array_equal(spoken.message, hidden)
+    # With only agent 2 let through to agent 0, the mean is over agent 2.
+    two = net.speak(hidden, near._replace(adjacency=near.adjacency.at[0, 1].set(False)), Channel(), None, 1.0)
+    np.testing.assert_allclose(two.hidden[0], np.tanh([0.1 + 0.6, 0.2 + 0.4]), rtol=1e-5)
+
+
+def test_dial_units_are_noisy_while_learning_and_bits_when_played():
+    message, key = jnp.array([[-0.3, 0.0, 2.0]]), jax.random.key(3)
+    np.testing.assert_array_equal(discretise_regularise(message, None, 2.0), [[0, 0, 1]])
+    np.testing.assert_allclose(discretise_regularise(message, key, 0.0), sigmoid(message), rtol=1e-6)
+    drawn_noise = np.asarray(jax.random.normal(key, (1, 3)))
+    expected = sigmoid(np.asarray(message) + 2.0 * drawn_noise)
+    np.testing.assert_allclose(discretise_regularise(message, key, 2.0), expected, rtol=1e-5)
+
+    net, hidden = talk("dial", dial_noise=0.5), jax.random.normal(key, (3, 8))
+    units = net.encode(hidden)
+    near = Neighbourhood(EVERYONE, jnp.zeros((3, 3, 2)))
+    spoken = net.speak(hidden, near, Channel(), None, 1.0)
+    np.testing.assert_array_equal(spoken.inbox, units > 0)
+    np.testing.assert_array_equal(spoken.hidden, hidden)  # heard at the next step only
+    noisy = net.speak(hidden, near, Channel(), key, 1.0).inbox
+    np.testing.assert_allclose(noisy, sigmoid(units + 0.5 * jax.random.normal(key, (3, 3))), rtol=1e-5)
+    heard = net.hear(hidden, spoken.inbox, near, Channel(), None)
+    mean = (np.asarray(spoken.inbox)[1] + np.asarray(spoken.inbox)[2]) / 2
+    decoded = np.maximum(np.asarray(net.decode.weight) @ mean + np.asarray(net.decode.bias), 0)
+    np.testing.assert_allclose(heard[0], np.asarray(hidden)[0] + decoded, rtol=1e-5)
+
+
+def test_symbols_are_one_hot_and_their_entropy_is_that_of_their_distribution():
+    """Played: the most likely. Learning, discrete: one-hot, as often as softmax(logits / τ = 1) says."""
+    net, hidden = talk("discrete"), jnp.zeros((3, 8)).at[:, 0].set(jnp.array([0.0, 1.0, 2.0]))
+    encode = eqx.tree_at(
+        lambda layer: (layer.weight, layer.bias),
+        net.encode[0],
+        (jnp.zeros((3, 8)).at[1, 0].set(1.0), jnp.array([0.1, 0.0, 0.0])),
+    )
+    net = eqx.tree_at(lambda n: n.encode[0], net, encode)
+    logits = np.array([[0.1, 0, 0], [0.1, 1, 0], [0.1, 2, 0]])
+    chances = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    near = Neighbourhood(EVERYONE, jnp.zeros((3, 3, 2)))
+    say = eqx.filter_jit(lambda key: net.speak(hidden, near, Channel(), key, 1.0))
+    np.testing.assert_array_equal(say(None).message, [[1, 0, 0], [0, 1, 0], [0, 1, 0]])
+    np.testing.assert_allclose(say(None).entropy, -(chances * np.log(chances)).sum(1), rtol=1e-5)
+    said = np.asarray(jax.jit(jax.vmap(lambda key: say(key).message))(jax.random.split(jax.random.key(0), 4_000)))
+    assert (np.sort(said.round(5), axis=-1) == [0, 0, 1]).all()
+    assert np.abs(said.mean(0) - chances).max() < 5 * np.sqrt(0.25 / 4_000)
+
+
+# Who is heard.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_who_is_silenced_is_not_heard_at_all(kind: str):
+    """A channel with no edge is an agent alone; one without an edge is the graph without it."""
+    env, graph = Spread(3, 2), EVERYONE.at[2, 0].set(False)
+    config = NetworkConfig(width=8, vocabulary=3, communication=kind, rounds=2)
+    network = drawn(AgentNetwork, env, config, 5)
+    _, seen = env.reset(jax.random.key(0))
+    memory = AgentMemory((), jax.random.uniform(jax.random.key(1), (3, 3))) if kind == "dial" else ()
+    act = eqx.filter_jit(
+        lambda graph, keep: (
+            network(seen._replace(adjacency=graph), memory, jax.random.key(2), Channel(edge_keep=keep))[0].head
+        )
+    )
+    open_channel, closed = jnp.ones((3, 3)), jnp.zeros((3, 3))
+    alone, together = act(graph & False, open_channel), act(graph, open_channel)
+    np.testing.assert_allclose(act(graph, closed), alone, atol=1e-6)
+    cut = act(graph, open_channel.at[0, 1].set(0.0))
+    np.testing.assert_allclose(cut, act(graph.at[0, 1].set(False), open_channel), atol=1e-6)
+    assert (np.abs(together - alone).max(1) > 1e-3).all()
+    assert np.abs(cut[0] - together[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("kind", ["commnet", "dial", "discrete"])
+def test_nobody_outside_the_radius_is_heard(kind: str):
+    """Agents 0 and 1 hear each other, 2 is too far; whatever it says changes nothing for them."""
+    net = talk(kind, rounds=2)
+    positions = jnp.array([[0.0, 0.0], [1.0, 0.0], [2.1, 0.0]])
+    near = Neighbourhood(
+        proximity_adjacency(positions, jnp.ones(3, bool), 1.05), positions[None] - positions[:, None]
+    )
+
+    @eqx.filter_jit
+    def hears(said: jax.Array) -> jax.Array:
+        """From what all hold (DIAL: said a step ago) to what agents 0 and 1 have after hearing."""
+        if kind == "dial":
+            return net.hear(jnp.zeros((3, 8)), said[:, :3], near, Channel(), None)
+        return net.speak(said, near, Channel(), None, 1.0).hidden
+
+    said = jax.random.normal(jax.random.key(0), (3, 8))
+    before, after = hears(said), hears(said.at[2].set(-said[2]))
+    np.testing.assert_array_equal(after[:2], before[:2])
+    other = hears(said.at[1].set(-said[1]))
+    assert np.abs(other[0] - before[0]).max() > 1e-3
+    if kind == "dial":
+        np.testing.assert_array_equal(before[2], np.maximum(net.decode.bias, 0))
+
+
+# Gradients.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_flow_from_hearer_to_speaker(kind: str):
+    """Two steps; the derivative of what one agent puts out by what the other saw. Agent 0 hears 1, not 1 him.
+
+    DIAL's come through time: what was said at the first step is heard at the second.
+    """
+    env = Probe()
+    config = NetworkConfig(width=16, vocabulary=4, communication=kind, dial_noise=0.5, recurrent=kind == "dial")
+    network = drawn(AgentNetwork, env, config, 2)
+    _, seen = env.reset(jax.random.key(0))
+    seen = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, *leaf.shape)), seen)
+    seen = seen._replace(adjacency=jnp.broadcast_to(jnp.array([[False, True], [False, False]]), (2, 2, 2)))
+    keys, first = jax.random.split(jax.random.key(1), 2), jnp.array([True, False])
+    features = jax.random.normal(jax.random.key(2), (2, 2, 2))
+
+    @eqx.filter_jit
+    def slopes(network: AgentNetwork) -> jax.Array:
+        def heads(features: jax.Array) -> jax.Array:
+            inputs = seen._replace(features=features), first, network.initial_memory(2), keys
+            return unroll(network, *inputs)[0].head
+
+        return jnp.abs(jax.jacobian(heads)(features)).sum((2, 5))  # [step, agent] by [step, agent]
+
+    found = np.asarray(slopes(network))
+    assert (found[[0, 1], :, [0, 1], :][:, [0, 1], [0, 1]] > 0).all()  # each by what itself sees now
+    same_step, later = found[1, 0, 1, 1], found[1, 0, 0, 1]
+    if kind == "dial":
+        assert same_step == 0 and later > 1e-3
+    else:
+        assert same_step > 1e-3 and later == 0
+    assert (found[:, 1, :, 0] == 0).all()  # nothing from 0 to 1
+    assert (found[0, :, 1, :] == 0).all()  # nor backward in time
