@@ -3,7 +3,9 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from gacrl.algorithms.shared import mean_real
 
 
 def clipped_surrogate(
@@ -53,10 +55,13 @@ def no_returns() -> ValueNorm:
     return ValueNorm(zero, zero, zero)
 
 
-def follow_returns(norm: ValueNorm, returns: Float[Array, "*b"], step: float = 0.01) -> ValueNorm:
-    """Move the moments towards those of the returns (MAPPO's ValueNorm, with a step that suits short runs)."""
+def follow_returns(
+    norm: ValueNorm, returns: Float[Array, "*b"], real: Bool[Array, "*b"], step: float = 0.01
+) -> ValueNorm:
+    """Move the moments towards those of the real agents' returns (MAPPO's ValueNorm, with a step that suits short
+    runs)."""
     return ValueNorm(
-        norm.first + step * (returns.mean() - norm.first),
-        norm.second + step * (jnp.square(returns).mean() - norm.second),
+        norm.first + step * (mean_real(returns, real) - norm.first),
+        norm.second + step * (mean_real(jnp.square(returns), real) - norm.second),
         norm.weight + step * (1.0 - norm.weight),
     )

@@ -266,8 +266,8 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         memory = split_memory(rollout.first_memory)
         steps = experience_of(learner, rollout, turn_key)
         advantage, returns = targets(learner, steps, memory)
-        norm = follow_returns(learner.norm, returns) if config.value_norm else learner.norm
         real = steps.observation.agent_mask
+        norm = follow_returns(learner.norm, returns, real) if config.value_norm else learner.norm
         centre = mean_real(advantage, real)
         spread = jnp.sqrt(mean_real(jnp.square(advantage - centre), real))
         sample = Sample(

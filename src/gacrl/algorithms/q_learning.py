@@ -227,7 +227,8 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         last = last[:learned]
         after = jax.tree.map(lambda leaf: leaf[last], (seen.next_observation, memories, target_memories))
         future = jax.vmap(lambda *after: bootstrap(network, target, *after))(*after)
-        reward = share_reward(seen.reward, seen.observation.agent_mask, config.reward == "team")
+        shared = config.reward == "team" or value.shape[-1] == 1  # a value of the team is learned from its reward
+        reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
         reward = rewards.normalise(reward)[:, : value.shape[-1]]
         gamma = learner.hyper.gamma
         earned = sum(gamma**k * weight[k, :learned, None] * reward[k : k + learned] for k in range(config.n_step))
@@ -258,7 +259,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         rewards = learner.rewards
         if config.reward_norm:
             earned = share_reward(steps.reward, steps.observation.agent_mask, config.reward == "team")
-            rewards = follow_returns(rewards, earned)
+            rewards = follow_returns(rewards, earned, steps.observation.agent_mask)
         env_steps = learner.env_steps + num_envs * num_steps
         exploration = parts.exploration.follow(learner.exploration, steps)
         learner = learner._replace(replay=replay, rewards=rewards, exploration=exploration, env_steps=env_steps)
