@@ -145,6 +145,88 @@ class TerminalWatcher:
             self._console.print(table)
 
 
+class RunsWatcher:
+    """Follows several runs, one after the other: a live table of them on a terminal, elsewhere lines."""
+
+    def __init__(self) -> None:
+        self._console = _console()
+        self._alive = self._console.is_terminal
+        self._standing: dict[str, _Line | str] = {}
+        self._note: _Line | None = None
+        self._live = Live(
+            console=self._console, get_renderable=self._table, refresh_per_second=8, transient=not self._alive
+        )
+        self._stop = False
+        self.exit_code = 130
+        """What an early stop returns to the shell."""
+
+    def __enter__(self) -> "RunsWatcher":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def request_stop(self, exit_code: int) -> None:
+        """End the run under way at its next checkpoint, and begin no other."""
+        self._stop, self.exit_code = True, exit_code
+        self.say("stopping after the evaluation under way; once more to stop at once")
+
+    def planned(self, names: list[str]) -> None:
+        """These runs are going to be made."""
+        self._standing = dict.fromkeys(names, "waiting")
+        if self._alive:
+            self._live.start()
+
+    def finished(self, name: str, how: str) -> None:
+        """That run has come to its end, in one way or another."""
+        before = self._standing[name]
+        took = f", {before.seconds:.0f} s" if isinstance(before, _Line) else ""
+        self._standing[name] = how + took
+        if not self._alive:
+            self._print(f"{name}: {self._standing[name]}")
+
+    def say(self, sentence: str) -> None:
+        """Something that belongs to no run."""
+        self._note = _Line()
+        self._note.text = sentence
+        if not self._alive:
+            self._print(sentence)
+
+    def watcher(self, name: str) -> Watcher:
+        """The functions that the session of that run calls."""
+        line = self._standing[name] = _Line()
+
+        def tell(what: str) -> None:
+            line.text = what
+            if not self._alive:
+                self._print(f"{name}: {what}")
+
+        def progress(progress: Progress) -> None:
+            line.fraction = progress.env_steps / progress.total_env_steps
+            tell(describe(progress, progress.rows[0]["episodes_done"]))
+
+        return Watcher(
+            compiling=lambda: tell("compiling the training program"),
+            progress=progress,
+            finishing=lambda: tell("closing evaluation, episodes and GIF"),
+            warn=lambda sentence: print(f"gacrl: {sentence}", file=sys.stderr),
+            stop=lambda: self._stop,
+        )
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True)
+
+    def _table(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for name, standing in self._standing.items():
+            table.add_row(name, standing)
+        if self._note is not None:
+            table.add_row("", self._note)
+        return table
+
+
 def _console() -> Console:
     """Colours and the terminal's width on a terminal; elsewhere lines that a log can hold."""
     console = Console(highlight=False, markup=False, emoji=False)
@@ -162,11 +244,15 @@ class _Line:
         self._spinner = Spinner("dots")
         self._begun = time.monotonic()
 
+    @property
+    def seconds(self) -> float:
+        """Since it began."""
+        return time.monotonic() - self._begun
+
     def __rich__(self) -> Text:
         full = round(20 * self.fraction)
         bar = "━" * full + "╌" * (20 - full)
-        seconds = time.monotonic() - self._begun
-        line = Text(f" {bar} {self.text}  [{seconds:.0f} s]")
+        line = Text(f" {bar} {self.text}  [{self.seconds:.0f} s]")
         spinning = self._spinner.render(time.monotonic())
         return Text.assemble(spinning, line) if isinstance(spinning, Text) else line
 

@@ -3,9 +3,11 @@
 S seeds, K stretches of training (the episodes between two lines of the log), E episodes of a scripted policy.
 """
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -20,8 +22,20 @@ Play = Literal["training", "sampled", "greedy"]
 """The end of training, exploration and all; the closing evaluation sampled as in training; and greedy."""
 Metrics = Mapping[str, Float[np.ndarray, "..."]]
 
+COLUMNS: Mapping[str, str] = MappingProxyType(
+    {"paper": "the paper's reward", "mpe2": "MPE2's reward", "extended": "its own budget"}
+)
+"""What the algorithms are trained on: the paper's reward and curriculum, MPE2's reward, or a task of their own."""
 FINAL_EPISODES = 50
 """What the paper's final metrics cover, and what a random policy is averaged over beside them."""
+
+
+DIVERGED = "diverged.json"
+"""In the folder of a run that ended so: {because}."""
+
+
+class MissingRun(LookupError):
+    """What is asked for needs a run that diverged; says which."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +55,8 @@ class Series:
     """The difficulty at the end of each stretch."""
     final: Mapping[str, Metrics]
     """[S] of the closing evaluation, greedy and sampled."""
+    scripted: Mapping[str, Mapping[str, float]]
+    """What the scripted policies reach on the closing evaluation's starts."""
     seconds: float
     """Of all seeds together, evaluations and compilation included."""
 
@@ -53,7 +69,9 @@ class Series:
         mean = {name: values[:, -take:] @ weight for name, values in self.mean.items()}
         sd = {
             name: np.sqrt(
-                np.maximum((self.sd[name][:, -take:] ** 2 + values[:, -take:] ** 2) @ weight - mean[name] ** 2, 0.0)
+                np.maximum(
+                    (self.sd[name][:, -take:] ** 2 + values[:, -take:] ** 2) @ weight - mean[name] ** 2, 0.0
+                )
             )
             for name, values in self.mean.items()
         }
@@ -74,16 +92,32 @@ class Evidence:
 
     series: Mapping[tuple[str, str], Series]
     references: Mapping[tuple[str, str], Reference]
+    diverged: Mapping[tuple[str, str], str] = field(default_factory=dict[tuple[str, str], str])
+    """What ended the training of those that are not in `series`."""
+
+    def trained(self, column: str, who: str) -> Series:
+        """An algorithm's series. Raises MissingRun for one that diverged.
+
+        The column `mixed` has GACRL on the paper's reward and everyone else on MPE2's.
+        """
+        column = ("paper" if who == "GACRL" else "mpe2") if column == "mixed" else column
+        if (column, who) in self.diverged:
+            raise MissingRun(f"{who} diverged on {COLUMNS[column]}: {self.diverged[column, who]}")
+        return self.series[column, who]
+
+    def reference(self, column: str, who: str) -> Reference:
+        """A scripted policy in a column's task."""
+        return self.references["paper" if column == "mixed" else column, who]
 
     def values(self, weights: Mapping[str, float], who: str, play: Play, column: str) -> Float[np.ndarray, " S"]:
         """A measure (a weighted sum of metrics) at the end: one number a seed.
 
         A scripted policy has no seeds: its numbers are means over blocks of `FINAL_EPISODES` episodes.
         """
-        if (column, who) in self.series:
-            series = self.series[column, who]
+        if who not in SCRIPTED:
+            series = self.trained(column, who)
             return measured(weights, series.closing[0] if play == "training" else series.final[play])
-        reference = self.references[column, who]
+        reference = self.reference(column, who)
         return blocks(measured(weights, reference.stretches[-1] if play == "training" else reference.final))
 
 
@@ -102,14 +136,17 @@ def blocks(episodes: Float[np.ndarray, " E"], size: int = FINAL_EPISODES) -> Flo
 def read_series(path: Path) -> Series:
     """A finished run folder."""
     folder = RunFolder.open(path)
-    config, rows, summary = folder.config(), folder.metrics(), folder.summary()
+    config, rows = folder.config(), folder.metrics()
+    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
     by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
     ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
     kept = np.flatnonzero(ended.min(0) > 0)
     names = list(rows[0]["train"]["mean"])
 
     def stacked(what: str) -> dict[str, np.ndarray]:
-        return {name: np.array([[seen[k]["train"][what][name] for k in kept] for seen in by_seed]) for name in names}
+        return {
+            name: np.array([[seen[k]["train"][what][name] for k in kept] for seen in by_seed]) for name in names
+        }
 
     return Series(
         config=config,
@@ -120,6 +157,7 @@ def read_series(path: Path) -> Series:
         last=stacked("last_episode"),
         tasks=tuple(by_seed[0][k]["task"] for k in kept),
         final={kind: _final(summary["final"][kind]) for kind in ("greedy", "sampled")},
+        scripted=summary["references"],
         seconds=float(summary["wall_seconds"]),
     )
 
@@ -129,28 +167,34 @@ def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def gather(folders: Mapping[tuple[str, str], Path]) -> Evidence:
-    """The evidence of finished run folders, with the scripted policies played at the difficulty of GACRL's rows."""
-    series = {key: read_series(path) for key, path in folders.items()}
-    references = {
-        (column, name): _play(name, followed)
-        for (column, who), followed in series.items()
-        if who == "GACRL"
-        for name in SCRIPTED
+    """The evidence of run folders that are finished or diverged, and of scripted policies in the same tasks."""
+    diverged = {
+        key: json.loads((path / DIVERGED).read_text(encoding="utf-8"))["because"]
+        for key, path in folders.items()
+        if (path / DIVERGED).is_file()
     }
-    return Evidence(series, references)
+    series = {key: read_series(path) for key, path in folders.items() if key not in diverged}
+    references: dict[tuple[str, str], Reference] = {}
+    for column in ("paper", "mpe2"):
+        followed = next(found for (at, _), found in series.items() if at == column)  # GACRL's, where it is there
+        references |= {(column, name): _play(name, followed) for name in SCRIPTED}
+    return Evidence(series, references, diverged)
 
 
 def _play(name: str, followed: Series) -> Reference:
     """A scripted policy beside a series; a difficulty that stays the same is played once."""
+    config = replace(
+        followed.config, env=replace(followed.config.env, reward="paper")
+    )  # one program for all columns
     played: dict[tuple[float, float], dict[str, np.ndarray]] = {}
 
     def at(task: Mapping[str, float]) -> dict[str, np.ndarray]:
         key = (task["local_ratio"], task["coverage_threshold"])
         if key not in played:
-            episodes = reference_episodes(name, followed.config, task)
+            episodes = reference_episodes(name, config, task)
             played[key] = {metric: np.asarray(values, float) for metric, values in episodes.items()}
         return played[key]
 
-    env = followed.config.env
+    env = config.env
     configured = {"local_ratio": env.local_ratio, "coverage_threshold": env.coverage_threshold}
     return Reference(tuple(at(task) for task in followed.tasks), at(configured))

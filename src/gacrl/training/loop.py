@@ -16,6 +16,10 @@ from gacrl.errors import UserError
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
 
+class Diverged(UserError):
+    """A loss is no longer a finite number."""
+
+
 @dataclass(frozen=True)
 class Clock:
     """Seconds spent so far, over all the processes that worked on a run."""
@@ -67,7 +71,7 @@ def train(
 ) -> Iterator[Progress]:
     """Train from a state (fresh, or of a checkpoint at `env_steps`) to the configured end.
 
-    Yields after every chunk. Raises UserError as soon as a loss is not finite.
+    Yields after every chunk. Raises Diverged as soon as a loss is not finite.
     """
     clock = Clock() if clock is None else clock
     per_update = config.steps_per_update
@@ -158,7 +162,7 @@ def _require_finite(rows: tuple[dict[str, Any], ...]) -> None:
     for row in rows:
         for name, value in row["update"].items():
             if not np.isfinite(value):
-                raise UserError(
+                raise Diverged(
                     f"seed {row['seed']} diverged: {name} is {value} by environment step {row['env_steps']}; "
                     "the checkpoint before it is good, try a smaller learning rate"
                 )

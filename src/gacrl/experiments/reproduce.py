@@ -1,0 +1,243 @@
+"""The paper's experiment: GACRL, QMIX, MAPPO and IPPO on the paper's schedule, several seeds of each.
+
+Every pair of column and algorithm is a run folder of its own, so that a stopped reproduction goes on with what
+is missing. What the runs showed is judged in `claims` and written down in `reproduce_report`.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+from gacrl import config as configuration
+from gacrl.config import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig
+from gacrl.errors import UserError, reason
+from gacrl.experiments import evidence, reproduce_report
+from gacrl.experiments.claims import Judged, judge_all
+from gacrl.training import session
+from gacrl.training.loop import Diverged
+from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Run, Watcher
+
+Column = Literal["paper", "mpe2", "extended"]
+
+EPISODES, HORIZON = 1_500, 75
+ALGORITHMS: Mapping[str, str] = MappingProxyType(
+    {"GACRL": "paper", "QMIX": "qmix", "MAPPO": "mappo", "IPPO": "ippo"}
+)
+"""The paper's names, and the presets that train them."""
+
+_PPO: dict[str, Any] = {
+    "training": {"num_envs": 15, "num_steps": 25},
+    "algorithm": {
+        "num_minibatches": 4,
+        "update_epochs": 6,
+        "gamma": 0.9,
+        "gae_lambda": 0.8,
+        "clip_eps": 0.3,
+        "ent_coef": 0.001,
+        "learning_rate": 2e-3,
+        "network": {"width": 64},
+    },
+}
+_AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "paper": {},
+        "mappo": _PPO,
+        "ippo": _PPO,
+        "qmix": {
+            "training": {"num_envs": 5, "num_steps": 15},
+            "algorithm": {
+                "updates": 10,
+                "batch_size": 128,
+                "reward_norm": True,
+                "max_grad_norm": 1.0,
+                "n_step": 3,
+                "learning_rate": 1e-3,
+                "epsilon_steps": 30_000,
+                "network": {"width": 64},
+            },
+        },
+    }
+)
+"""What differs from a preset that has millions of steps, where it gets the paper's 112,500."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One run of the experiment: an algorithm in a column, all seeds."""
+
+    column: Column
+    who: str
+    config: RunConfig
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return f"{self.who}, {evidence.COLUMNS[self.column]}"
+
+    @property
+    def finished(self) -> bool:
+        """Nothing is left to do: it was trained to its end, or diverged."""
+        return any((self.folder / name).is_file() for name in ("summary.json", evidence.DIVERGED))
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a reproduction tells whoever looks on: all of it optional."""
+
+    planned: Callable[[list[str]], None] = lambda names: None
+    run: Callable[[str], Watcher] = lambda name: Watcher()
+    finished: Callable[[str, str], None] = lambda name, how: None
+    """(name, how it ended)."""
+    say: Callable[[str], None] = lambda sentence: None
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """A finished experiment and its report."""
+
+    out: Path
+    report: Path
+    judged: tuple[Judged, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "out": str(self.out),
+            "report": str(self.report),
+            "claims": {judged.claim.id: judged.base.verdict for judged in self.judged},
+        }
+
+
+def at_paper_budget(preset: str) -> RunConfig:
+    """A preset with settings that suit the paper's number of steps, on MPE2's task with its 75-step episodes."""
+    config = configuration.from_dict(_AT_PAPER_BUDGET[preset], configuration.preset(preset))
+    return replace(
+        config,
+        env=EnvConfig(max_cycles=HORIZON),
+        curriculum=CurriculumConfig(),
+        training=replace(config.training, env_steps=EPISODES * HORIZON),
+        evaluation=EvaluationConfig(interval=50 * HORIZON, num_episodes=8),
+    )
+
+
+def in_column(config: RunConfig, column: Column) -> RunConfig:
+    """The same with the column's reward: the paper's, and its curriculum; or MPE2's on an unchanging task."""
+    if column != "paper":
+        return config
+    paper = configuration.preset("paper")
+    return replace(config, env=replace(config.env, reward=paper.env.reward), curriculum=paper.curriculum)
+
+
+def plan(out: Path, seeds: int, episodes: int = EPISODES, extended: bool = False) -> list[Planned]:
+    """The runs of the experiment, in the order in which they are made."""
+    runs: list[Planned] = []
+    columns: tuple[Column, ...] = ("paper", "mpe2")
+    for column in columns:
+        for who, preset in ALGORITHMS.items():
+            config = in_column(at_paper_budget(preset), column)
+            config = replace(
+                config, num_seeds=seeds, training=replace(config.training, env_steps=episodes * HORIZON)
+            )
+            runs.append(Planned(column, who, config, out / f"{column}-{who.lower()}"))
+    if extended:
+        for who in ("gacrl", "qmix", "mappo", "ippo"):
+            if who in configuration.PRESETS:
+                config = replace(configuration.preset(who), num_seeds=seeds)
+                runs.append(Planned("extended", who, config, out / f"extended-{who}"))
+    return runs
+
+
+def reproduce(
+    out: Path, seeds: int = 5, episodes: int = EPISODES, extended: bool = False, watch: Watch | None = None
+) -> Reproduction | None:
+    """Train what is missing under `out`, judge every claim, write `report.html` and `report.md` there.
+
+    Returns None where the watcher's stop ended it early. Raises UserError for fewer than two seeds, or a folder
+    that holds something else.
+    """
+    watch = watch or Watch()
+    if seeds < 2:
+        raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
+    if episodes < 1:
+        raise UserError(f"--episodes must be at least 1, not {episodes}")
+    runs = plan(out, seeds, episodes, extended)
+    _claim_folder(out, {"seeds": seeds, "episodes": episodes})
+    for planned in runs:
+        _refuse_other_settings(planned)
+    watch.planned([planned.name for planned in runs])
+    if not train_missing(runs, watch):
+        return None
+    watch.say("playing random, noop and oracle at the difficulty of every stretch")
+    found = evidence.gather({(run.column, run.who): run.folder for run in runs})
+    if ("paper", "GACRL") in found.diverged:
+        raise UserError(f"there is nothing to compare with: GACRL's {found.diverged['paper', 'GACRL']}")
+    judged = judge_all(found)
+    watch.say("writing the report")
+    report = reproduce_report.write(out, found, judged, seeds, episodes)
+    return Reproduction(out, report, judged)
+
+
+def train_missing(runs: list[Planned], watch: Watch) -> bool:
+    """Train what is not finished, each from where it stopped; False where the watcher stopped it."""
+    for planned in runs:
+        if planned.finished:
+            watch.finished(planned.name, "there already")
+            continue
+        try:
+            if _train(planned, watch.run(planned.name)).summary is None:
+                return False
+            watch.finished(planned.name, "done")
+        except Diverged as error:
+            text = json.dumps({"because": str(error).partition(";")[0]}) + "\n"
+            (planned.folder / evidence.DIVERGED).write_text(text, encoding="utf-8")
+            watch.finished(planned.name, "diverged")
+    return True
+
+
+def _train(planned: Planned, watcher: Watcher) -> Run:
+    if (planned.folder / "config.json").is_file():
+        return session.resume(planned.folder, watcher=watcher)
+    _forget_half_made(planned.folder)
+    return session.start(planned.config, planned.folder, watcher)
+
+
+def _refuse_other_settings(planned: Planned) -> None:
+    """Raises UserError where the run's folder holds a run with other settings than planned."""
+    if (planned.folder / "config.json").is_file() and RunFolder.open(planned.folder).config() != planned.config:
+        raise UserError(
+            f"{planned.folder} was trained with other settings than this version plans: choose another --out, "
+            "or remove that folder to train it again"
+        )
+
+
+def _forget_half_made(folder: Path) -> None:
+    """Remove the empty folders of a run that was killed before it had settings."""
+    if folder.is_dir():
+        for inner in folder.iterdir():
+            if inner.is_dir() and not any(inner.iterdir()):
+                inner.rmdir()
+            elif inner.name.startswith(".config.json"):
+                inner.unlink()
+
+
+def _claim_folder(out: Path, asked: dict[str, int]) -> None:
+    """Make the folder and say in it what it is for; refuse one that is for something else."""
+    marker = out / "reproduce.json"
+    if marker.is_file():
+        held = json.loads(marker.read_text(encoding="utf-8"))
+        if held != asked:
+            was = " and ".join(f"--{name} {value}" for name, value in held.items())
+            raise UserError(f"{out} holds a reproduction with {was}: ask for the same, or choose another --out")
+        return
+    unfinished = out / ".reproduce.json.unfinished"
+    if out.exists() and (not out.is_dir() or any(entry != unfinished for entry in out.iterdir())):
+        raise UserError(f"{out} exists and holds no reproduction: choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        unfinished.write_text(json.dumps(asked) + "\n", encoding="utf-8")
+        unfinished.replace(marker)
+    except OSError as error:
+        raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
