@@ -117,6 +117,34 @@ class Render:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """Compare finished runs: interquartile means over seeds with 95 % intervals, differences, chances to be better.
+
+    Runs that differ in the seed alone are one group. Settings that make a comparison unequal are named; runs
+    of other tasks, horizons or versions of the environment are refused.
+
+    examples:
+      gacrl compare runs/mappo-1 runs/qmix-1
+      gacrl compare runs/gacrl-1 runs/gacrl-2 runs/vdn-1 --metric coverage_final_0.1 --out runs/comparison
+    """
+
+    run: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A metric of the closing evaluation; may be given several times. None: return and coverage within 0.1."""
+    sampled: bool = False
+    """Compare the policies as they explore, instead of greedily."""
+    out: Path | None = None
+    """A folder for the comparison as a page (HTML and Markdown) with figures."""
+    marl_eval: Path | None = None
+    """A file to write the runs into as marl-eval's raw data."""
+    overwrite: bool = False
+    """Replace a page or file that exists."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Presets:
     """List what can be trained by name.
 

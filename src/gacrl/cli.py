@@ -29,6 +29,7 @@ usage: gacrl COMMAND [OPTIONS]
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
   render     watch a run, random, noop or oracle: a GIF
+  compare    runs side by side: intervals over seeds, differences, what else differs
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -201,6 +202,29 @@ def _render(words: list[str]) -> int:
     return 0
 
 
+def _compare(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Compare, words, "compare")
+    from gacrl.experiments import compare, compare_report
+
+    files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval]
+    for path in files:
+        if path is not None and path.exists() and not asked.overwrite:
+            raise UserError(f"{path} exists: choose another place, or say --overwrite")
+    play = "sampled" if asked.sampled else "greedy"
+    comparison = compare.compare(asked.run, asked.metric or compare.METRICS, play, _warn)
+    compare_report.print_comparison(comparison)
+    if asked.out is not None:
+        print(f"page       {compare_report.write_page(comparison, asked.out)}")
+    if asked.marl_eval is not None:
+        asked.marl_eval.write_text(json.dumps(compare.to_marl_eval(comparison)) + "\n", encoding="utf-8")
+        print(f"marl-eval  {asked.marl_eval}")
+    if asked.json:
+        print(json.dumps(compare.to_dict(comparison)))
+    return 0
+
+
 def _presets(words: list[str]) -> int:
     from gacrl import arguments
 
@@ -250,6 +274,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "resume": _resume,
     "evaluate": _evaluate,
     "render": _render,
+    "compare": _compare,
     "presets": _presets,
     "config": _config,
     "doctor": _doctor,

@@ -23,6 +23,7 @@ CONFIDENCE = 0.95
 POWER = 0.8
 """Probability of seeing a difference that is there, for the smallest detectable one."""
 
+Numbers: TypeAlias = ArrayLike | Sequence[Any]
 Floats: TypeAlias = NDArray[np.float64]
 Statistic: TypeAlias = Callable[[Floats], Any]
 """Reduces scores [..., S, K] to [...], so that all resamples are one call."""
@@ -69,7 +70,7 @@ class Curve(NamedTuple):
     high: Floats
 
 
-def iqm(values: ArrayLike) -> Any:
+def iqm(values: Numbers) -> Any:
     """Interquartile mean: of all S × K scores, without the ⌊S K / 4⌋ lowest and as many of the highest.
 
     values: [S] or [..., S, K]. Returns [...]; a number for [S] and [S, K].
@@ -80,12 +81,12 @@ def iqm(values: ArrayLike) -> Any:
     return ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
 
 
-def mean(values: ArrayLike) -> Any:
+def mean(values: Numbers) -> Any:
     """Mean of all scores: [S] or [..., S, K] to [...]."""
     return _scores(values).mean((-2, -1))
 
 
-def median(values: ArrayLike) -> Any:
+def median(values: Numbers) -> Any:
     """Median over tasks of each task's mean, as in rliable; with scores [S] of one task, the median of its seeds.
 
     [S] or [..., S, K] to [...]. With one task as [S, 1] it is the median of the seeds as well (rliable: the mean).
@@ -96,12 +97,12 @@ def median(values: ArrayLike) -> Any:
     return np.median(scores.mean(-2), axis=-1)
 
 
-def optimality_gap(values: ArrayLike, optimum: float = 1.0) -> Any:
+def optimality_gap(values: Numbers, optimum: float = 1.0) -> Any:
     """The mean shortfall from the optimum; scores beyond it count as reaching it. [S] or [..., S, K] to [...]."""
     return optimum - np.minimum(_scores(values), optimum).mean((-2, -1))
 
 
-def estimate(values: ArrayLike, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Estimate:
+def estimate(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Estimate:
     """A statistic of scores [S] or [S, K] with its 95 % stratified-bootstrap interval.
 
     statistic: reduces [..., S, K] to [...]. Raises UserError for fewer than two seeds, or what is not a number.
@@ -111,9 +112,7 @@ def estimate(values: ArrayLike, statistic: Statistic = iqm, reps: int = 2000, se
     return Estimate(float(statistic(scores)), *_interval(resampled))
 
 
-def difference(
-    a: ArrayLike, b: ArrayLike, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0
-) -> Difference:
+def difference(a: Numbers, b: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Difference:
     """The statistic of a less that of b, with its 95 % interval: both are resampled, independently.
 
     a: [S] or [S, K]; b: [S'] or [S', K]. Raises UserError for fewer than two seeds, other tasks, or NaN.
@@ -126,7 +125,7 @@ def difference(
     return Difference(float(statistic(first) - statistic(second)), low, high, _detectable(first, second), verdict)
 
 
-def detectable(a: ArrayLike, b: ArrayLike) -> float:
+def detectable(a: Numbers, b: Numbers) -> float:
     """The smallest difference of means that a two-sided t-test at 5 % sees with 80 % power (Cohen 1988, ch. 2).
 
     The spread is pooled over both, within tasks. Scores as for `difference`. An IQM of scores that are about
@@ -135,7 +134,7 @@ def detectable(a: ArrayLike, b: ArrayLike) -> float:
     return _detectable(*_checked_pair(a, b))
 
 
-def probability_of_improvement(a: ArrayLike, b: ArrayLike, reps: int = 2000, seed: int = 0) -> Estimate:
+def probability_of_improvement(a: Numbers, b: Numbers, reps: int = 2000, seed: int = 0) -> Estimate:
     """P(a seed of a scores higher than a seed of b), ties half, the mean over tasks, with its 95 % interval.
 
     The Mann-Whitney U statistic over the number of pairs (Agarwal et al. 2021). Scores as for `difference`. A
@@ -148,7 +147,7 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike, reps: int = 2000, see
     return Estimate(float(_improvement(first, second)), *_interval(resampled))
 
 
-def equivalent(a: ArrayLike, b: ArrayLike, margin: float) -> Equivalence:
+def equivalent(a: Numbers, b: Numbers, margin: float) -> Equivalence:
     """Whether the means of a and b differ by less than `margin`: two one-sided Welch tests (Schuirmann 1987).
 
     That an interval includes 0 shows no equality; only this does. Scores as for `difference`; of K tasks it is
@@ -170,7 +169,7 @@ def equivalent(a: ArrayLike, b: ArrayLike, margin: float) -> Equivalence:
     return Equivalence(point, float(margin), p_value, p_value < 1 - CONFIDENCE)
 
 
-def performance_profile(values: ArrayLike, thresholds: ArrayLike, reps: int = 2000, seed: int = 0) -> Curve:
+def performance_profile(values: Numbers, thresholds: Numbers, reps: int = 2000, seed: int = 0) -> Curve:
     """The share of runs that score above each of P thresholds, with pointwise 95 % intervals.
 
     values: [S] or [S, K]; thresholds: [P]. Raises UserError as `estimate` does.
@@ -183,7 +182,7 @@ def performance_profile(values: ArrayLike, thresholds: ArrayLike, reps: int = 20
     return Curve(point, low, high)
 
 
-def sample_efficiency(values: ArrayLike, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Curve:
+def sample_efficiency(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Curve:
     """A statistic at each of P evaluations, pointwise 95 % intervals; a resampled seed brings its whole curve.
 
     values: [S, P] of one task or [S, K, P]. Raises UserError for fewer than two seeds, or what is not a number.
@@ -277,13 +276,13 @@ def _read_run(environment: str, task: str, algorithm: str, run: str, content: Ma
     )
 
 
-def _scores(values: ArrayLike) -> Floats:
+def _scores(values: Numbers) -> Floats:
     """[..., S, K]; seeds of one task, [S], become [S, 1]."""
     scores = np.asarray(values, float)
     return scores[:, None] if scores.ndim == 1 else scores
 
 
-def _checked(values: ArrayLike) -> Floats:
+def _checked(values: Numbers) -> Floats:
     """[S, K], finite, of at least two seeds."""
     scores = _scores(values)
     if scores.ndim != 2 or scores.shape[1] == 0:
@@ -293,7 +292,7 @@ def _checked(values: ArrayLike) -> Floats:
     return scores
 
 
-def _checked_pair(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
+def _checked_pair(a: Numbers, b: Numbers) -> tuple[Floats, Floats]:
     first, second = _checked(a), _checked(b)
     if first.shape[1] != second.shape[1]:
         raise UserError(

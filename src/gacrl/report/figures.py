@@ -6,7 +6,7 @@ the data.
 """
 
 import io
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
@@ -21,7 +21,8 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 _DASHES = ("-", "--", "-.", ":")
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X")
 
-Series: TypeAlias = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None, ArrayLike | None]
+Numbers: TypeAlias = ArrayLike | Sequence[Any]
+Series: TypeAlias = tuple[Numbers, Numbers, Numbers | None, Numbers | None, Numbers | None]
 """x [P], the line [P], its interval's bounds [P] (None: no interval), each seed's line [S, P] (None: none)."""
 
 _LOOK = {
@@ -58,7 +59,7 @@ def curves(
         for name, height in (lines or {}).items():
             axes.axhline(height, color="#555555", linewidth=1, linestyle=(0, (1, 2)))
             axes.annotate(
-                f"{name} ",
+                _literal(name),
                 (0, height),
                 xycoords=("axes fraction", "data"),
                 xytext=(3, 2),
@@ -72,7 +73,7 @@ def curves(
 
 
 def dots(
-    values: Mapping[str, ArrayLike],
+    values: Mapping[str, Numbers],
     estimates: Mapping[str, tuple[float, float, float] | None],
     xlabel: str,
     lines: Mapping[str, float] | None = None,
@@ -95,7 +96,7 @@ def dots(
         for name, place in (lines or {}).items():
             axes.axvline(place, color="#555555", linewidth=1, linestyle=(0, (1, 2)))
             axes.annotate(
-                name,
+                _literal(name),
                 (place, 1),
                 xycoords=("data", "axes fraction"),
                 xytext=(0, 3),
@@ -104,7 +105,7 @@ def dots(
                 fontsize=9,
                 ha="center",
             )
-        axes.set_yticks(range(len(values)), list(values))
+        axes.set_yticks(range(len(values)), _literals(values))
         axes.set_ylim(len(values) - 0.5, -0.5)
         axes.grid(visible=False, axis="y")
         _say(axes, xlabel, "")
@@ -112,7 +113,7 @@ def dots(
 
 
 def profile(
-    profiles: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]],
+    profiles: Mapping[str, tuple[Numbers, Numbers, Numbers | None, Numbers | None]],
     xlabel: str,
     ylabel: str = "share of runs above",
 ) -> str:
@@ -133,7 +134,7 @@ def profile(
 
 
 def heat(
-    values: ArrayLike,
+    values: Numbers,
     panels: tuple[str, Sequence[str]],
     rows: tuple[str, Sequence[str]],
     columns: tuple[str, Sequence[str]],
@@ -159,13 +160,13 @@ def heat(
                     dark = value < (low + high) / 2
                     color = "white" if dark else "black"
                     axes.text(j, i, f"{value:.3g}", ha="center", va="center", color=color, fontsize=10)
-            axes.set_title(f"{panels[0]} {name}")
-            axes.set_xticks(range(shape[2]), list(columns[1]))
-            axes.set_yticks(range(shape[1]), list(rows[1]))
+            axes.set_title(_literal(f"{panels[0]} {name}"))
+            axes.set_xticks(range(shape[2]), _literals(columns[1]))
+            axes.set_yticks(range(shape[1]), _literals(rows[1]))
             axes.grid(visible=False)
             _say(axes, columns[0], rows[0] if axes is plots[0] else "")
         if image is not None:
-            figure.colorbar(image, ax=plots, label=label)
+            figure.colorbar(image, ax=plots, label=_literal(label))
     return out.getvalue()
 
 
@@ -199,7 +200,11 @@ def _say(axes: Axes, xlabel: str, ylabel: str) -> None:
 def _legend(axes: Axes) -> None:
     handles, names = axes.get_legend_handles_labels()
     if handles:
-        axes.legend(handles, [_literal(name) for name in names], loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        axes.legend(handles, _literals(names), loc="upper left", bbox_to_anchor=(1.01, 1.0))
+
+
+def _literals(texts: Iterable[str]) -> list[str]:
+    return [_literal(text) for text in texts]
 
 
 def _literal(text: str) -> str:
