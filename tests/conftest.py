@@ -64,6 +64,16 @@ def drawn(build: Any, *settings: Any, seed: int = 0) -> Any:
     )
 
 
+def drawn_learner(algorithm: Any, seed: int = 0) -> Any:
+    """A learner at its start, its network drawn as above."""
+    shapes = eqx.filter_eval_shape(algorithm.init, jax.random.key(0), algorithm.hyper)
+    learner = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    hyper = jax.tree.map(lambda number: jnp.asarray(number, float), algorithm.hyper)
+    network = drawn(lambda key: algorithm.init(key, algorithm.hyper).network, seed=seed)
+    learner = learner._replace(network=network, hyper=hyper)
+    return learner._replace(target=network) if hasattr(learner, "target") else learner
+
+
 class TinyRun(NamedTuple):
     folder: Path
     words: list[str]

@@ -1,0 +1,254 @@
+"""Q-learning from replay: its targets against NumPy and rlax, windows of the ring, exploration, slow targets."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rlax
+from conftest import drawn_learner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gacrl.algorithms import exploration, q_learning, replay
+from gacrl.algorithms.q_learning import Network, Parts, epsilon_greedy
+from gacrl.algorithms.qmix import MIXERS
+from gacrl.config import QmixConfig, TrainingConfig
+from gacrl.envs.spread import Spread
+from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
+from gacrl.types import Decision, Observation, Rollout, Transition
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+N, A = 3, 5
+ENV = Spread(N, 1)
+REAL = np.array([True, True, False])
+GAMMA = 0.9
+
+
+class Table(AgentNetwork):
+    """Q-values that stand in the first features, times a number that is learned; and 0.5 for each step remembered."""
+
+    scale: jax.Array
+    remembers: bool = eqx.field(static=True)
+
+    def __init__(self, remembers: bool):
+        self.torso = self.code = self.memory = self.communication = self.head = None  # type: ignore
+        self.radius, self.scale, self.remembers = 0.0, jnp.ones(1), remembers
+
+    def initial_memory(self, num_agents: int) -> Any:
+        return AgentMemory(jnp.zeros((num_agents, 1)), ()) if self.remembers else ()
+
+    def __call__(self, observation: Observation, memory: Any = (), *unused: Any) -> tuple[AgentOutput, Any]:
+        head = self.scale[0] * observation.features[:, :A]
+        if isinstance(memory, AgentMemory):
+            head, memory = head + 0.5 * memory.carry, AgentMemory(memory.carry + 1, ())
+        near = jnp.zeros((N, N), bool)
+        return AgentOutput(head, head, None, near, 0.0, 0.0), memory
+
+
+def features(seed: int, steps: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(steps, N, ENV.observation_size)).astype(np.float32)
+
+
+class Case(NamedTuple):
+    mixer: Any
+    n_step: int
+    learned: int
+    remembers: bool
+    double_q: bool = True
+    reward_norm: bool = False
+
+
+def hand_made(steps: int, remembers: bool) -> Rollout:
+    """One environment: the task ends at step 1, the time limit is at step 3; what followed stands apart."""
+    rng = np.random.default_rng(7)
+    _, observation = ENV.reset(jax.random.key(0))
+    seen, after = (
+        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, 1, *leaf.shape)), observation)._replace(
+            features=jnp.asarray(features(seed, steps))[:, None], agent_mask=jnp.broadcast_to(REAL, (steps, 1, N))
+        )
+        for seed in (1, 2)
+    )
+    action = jnp.asarray(rng.integers(A, size=(steps, 1, N)), jnp.int32)
+    memory = AgentMemory(jnp.full((steps, 1, N, 1), 2.0), ()) if remembers else ()
+    end = np.arange(steps)[:, None]
+    return Rollout(
+        Transition(
+            observation=seen,
+            decision=Decision(action, extras={"choice": action, "memory": memory, "mode": ()}),
+            reward=jnp.asarray(rng.normal(size=(steps, 1, N)), jnp.float32),
+            terminated=jnp.asarray(end == 1),
+            truncated=jnp.asarray(end == 3),
+            first=jnp.asarray((end == 2) | (end == 4)),
+            next_observation=after,
+            info={},
+        ),
+        (),
+        (),
+    )
+
+
+def expected_errors(case: Case, given: Rollout, scale: float, target_scale: float) -> np.ndarray:
+    """value − target of each step learned from, and each value: loops over the text, in float64."""
+    steps = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], given.transitions)
+    here, after = (np.asarray(o.features[..., :A], float) for o in (steps.observation, steps.next_observation))
+    reward = np.asarray(steps.reward, float)
+    team = case.mixer != "iql"
+    if case.reward_norm:  # one step of the running moments: the batch's own
+        earned = reward[:, REAL]
+        reward = (reward[:, REAL] - earned.mean()) / earned.std()
+        reward = np.concatenate([reward, np.zeros((len(reward), 1))], axis=1)
+    carry, errors = 2.0, []
+    remembered = []
+    for t in range(len(here)):
+        carry = 0.0 if steps.first[t] else carry
+        remembered.append(carry)
+        carry += 1
+    bonus = 0.5 if case.remembers else 0.0
+    for t in range(case.learned):
+        total, k = np.zeros(N), 0
+        while True:
+            shared = np.full(N, reward[t + k][REAL].mean()) if team else reward[t + k]
+            total += GAMMA**k * shared
+            last = t + k
+            k += 1
+            if k == case.n_step or steps.terminated[last] or steps.truncated[last]:
+                break
+        heard = bonus * (remembered[last] + 1)
+        online, slow = scale * after[last] + heard, target_scale * after[last] + heard
+        best = (online if case.double_q else slow).argmax(-1)
+        future = slow[np.arange(N), best]
+        value = (scale * here[t] + bonus * remembered[t])[np.arange(N), steps.decision.action[t]]
+        if team:
+            total, future, value = total[:1], future[REAL].sum(keepdims=True), value[REAL].sum(keepdims=True)
+        target = total + (0.0 if steps.terminated[last] else GAMMA**k * future)
+        errors.append((value - target)[REAL] if not team else value - target)
+    return np.array(errors)
+
+
+CASES = {
+    "IQL, one step": Case("iql", 1, 1, False),
+    "IQL, three steps, not double": Case("iql", 3, 4, False, double_q=False),
+    "VDN, three steps, recurrent, normed": Case("vdn", 3, 4, True, reward_norm=True),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_loss_is_that_of_the_text(name: str):
+    """On a window with an end of the task and a time limit in it. VDN has the team's reward, also of 'own' ones."""
+    case = CASES[name]
+    steps = case.learned + case.n_step - 1
+    config = QmixConfig(
+        mixer=case.mixer,
+        n_step=case.n_step,
+        sequence_length=case.learned,
+        double_q=case.double_q,
+        reward_norm=case.reward_norm,
+        reward="own",
+        gamma=GAMMA,
+        replay_capacity=steps,
+        batch_size=2,
+        updates=1,
+        learning_starts=0,
+        learning_rate=0.01,
+        learning_rate_end=0.01,
+        target_step=0.25,
+    )
+    parts = Parts(
+        networks=lambda key: Network(Table(case.remembers), ()),
+        team_value=MIXERS[case.mixer],
+        exploration=exploration.linear((1.0, 0.1), 100),
+        auxiliary=lambda output: {},
+    )
+    algorithm = q_learning.make(config, ENV, TrainingConfig(env_steps=1_000, num_envs=1, num_steps=steps), parts)
+    update = jax.jit(algorithm.update)
+
+    def at(network: Network, scale: float) -> Network:
+        return jax.tree.map(lambda leaf: jnp.full_like(leaf, scale), network)
+
+    learner = drawn_learner(algorithm)
+    learner = learner._replace(network=at(learner.network, 1.3), target=at(learner.target, -0.7))
+    given = hand_made(steps, case.remembers)
+    after, metrics = update(learner, given, jax.random.key(0))
+    errors = expected_errors(case, given, 1.3, -0.7)
+    assert np.abs(errors).max() < q_learning.HUBER_DELTA
+    np.testing.assert_allclose(metrics["loss_td"], 0.5 * np.square(errors).mean(), rtol=1e-5)
+
+    if case.learned == case.n_step == 1:
+        one = jax.tree.map(lambda leaf: leaf[0, 0], given.transitions)
+        online, slow = (scale * one.next_observation.features[:, :A] for scale in (1.3, -0.7))
+        theirs = jax.vmap(rlax.double_q_learning, (0, 0, 0, None, 0, 0))(
+            1.3 * one.observation.features[:, :A], one.decision.action, one.reward, GAMMA, slow, online
+        )
+        np.testing.assert_allclose(-errors[0], theirs[REAL], rtol=1e-5)
+
+    # One step of Adam, and the target network a quarter of the way.
+    moved = float(after.network.agent.scale[0])
+    np.testing.assert_allclose(abs(moved - 1.3), 0.01, rtol=1e-3)
+    np.testing.assert_allclose(after.target.agent.scale[0], -0.7 + 0.25 * (moved + 0.7), rtol=1e-5)
+    ahead, behind = (np.square(expected_errors(case, given, s, -0.7)).mean() for s in (moved, 1.3))
+    assert int(after.env_steps) == steps and metrics["epsilon"] == pytest.approx(1 - 0.9 * steps / 100)
+    if case.n_step == 1:
+        assert ahead < behind
+
+    # Too early nothing is learned, but everything is remembered.
+    early = learner._replace(env_steps=jnp.int32(-10))
+    after, metrics = update(early, given, jax.random.key(0))
+    assert after.network.agent.scale[0] == learner.network.agent.scale[0] and metrics["loss_td"] == 0
+    assert int(after.replay.added) == steps
+
+
+# The ring.
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.sampled_from([(4, 1), (4, 3), (9, 2), (9, 9)]),
+    st.integers(0, 40),
+    st.integers(0, 2**31 - 1),
+)
+def test_windows_never_straddle_the_newest_and_the_oldest(sizes: tuple[int, int], more: int, seed: int):
+    """Items are numbered as they were added; whatever the ring holds, a window counts up by one."""
+    capacity, length = sizes
+    added = length + more
+    numbers = np.full(capacity, -1)
+    for number in range(added):
+        numbers[number % capacity] = number
+    ring = replay.Replay(jnp.asarray(numbers), jnp.int32(added))
+    rows = replay.sample_windows(ring, jax.random.key(seed), 64, length)
+    found = numbers[np.asarray(rows)]
+    np.testing.assert_array_equal(np.diff(found, axis=0), np.ones((length - 1, 64)))
+    oldest = max(0, added - capacity)
+    assert found.min() >= oldest and found.max() < added
+    possible = range(oldest, added - length + 1)
+    assert len(set(found[0])) >= min(len(possible), 3), "all of the stored steps are drawn from"
+
+
+def test_blocks_go_in_place_of_the_oldest():
+    ring = replay.empty(jnp.zeros(()), 6)
+    for start in range(0, 10, 2):
+        ring = replay.add_block(ring, jnp.arange(start, start + 2) * 1.0)
+    np.testing.assert_array_equal(ring.items, [6, 7, 8, 9, 4, 5])
+    assert (int(ring.added), int(ring.size)) == (10, 6)
+
+
+# Exploration.
+
+
+def test_epsilon_greedy_frequencies():
+    """ε = 0.3, three of four actions available: the best 0.7 + 0.1, the other two 0.1 each; agents by themselves."""
+    values = jnp.array([[9.0, 1.0, 2.0, 0.0], [0.0, 3.0, 1.0, 2.0]])
+    mask = jnp.array([[False, True, True, True], [True, True, True, False]])
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    act = jax.jit(jax.vmap(lambda key, epsilon: epsilon_greedy(key, values, mask, epsilon), (0, None)))
+    chosen = np.asarray(act(keys, jnp.float32(0.3)))
+    slack = 5 * np.sqrt(0.25 / len(keys))
+    for agent, expected in enumerate(([0, 0.1, 0.8, 0.1], [0.1, 0.8, 0.1, 0])):
+        counts = np.bincount(chosen[:, agent], minlength=4) / len(keys)
+        assert np.abs(counts - expected).max() < slack and counts[np.array(expected) == 0] == 0
+    best = chosen == [2, 1]
+    assert abs(best.all(1).mean() - 0.8 * 0.8) < slack
+    assert (np.asarray(act(keys[:100], jnp.float32(0.0))) == [2, 1]).all()
