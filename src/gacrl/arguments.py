@@ -169,6 +169,53 @@ class Config:
 
 
 @dataclass(frozen=True)
+class Reproduce:
+    """Make the paper's whole experiment, and a report of every table, figure and claim, theirs beside ours.
+
+    GACRL, QMIX, MAPPO and IPPO train on the paper's reward and on MPE2's own; random, noop and oracle play the
+    same task. Stopped or killed, the same command goes on with what is missing.
+
+    examples:
+      gacrl reproduce                                 5 seeds: about ten minutes on two cores
+      gacrl reproduce --seeds 2 --episodes 200 --out runs/look
+    """
+
+    seeds: int = 5
+    """Seeds of each algorithm."""
+    episodes: int = 1500
+    """Episodes of each seed; fewer stop the paper's schedule early."""
+    out: Path = Path("runs/reproduce")
+    """The folder of the runs and the report."""
+    extended: bool = False
+    """Also train each algorithm with its own preset and budget on MPE2's task: millions of steps."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Train a grid of settings in one program, and say how much of its spread chance alone makes.
+
+    paper-grid is the paper's: learning rate × ε₀ × τ₀, 27 points, by shaped reward over the first 500 episodes;
+    the winner is trained again on fresh seeds beside the paper's choice. Stopped, the same command goes on.
+
+    example:
+      gacrl sweep paper-grid --out runs/grid
+    """
+
+    grid: tyro.conf.Positional[Literal["paper-grid"]]
+    """Which grid."""
+    seeds: int = 2
+    """Seeds of each point."""
+    episodes: int = 500
+    """Episodes of each seed."""
+    out: Path = Path("runs/paper-grid")
+    """The folder of the results and the report."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Check this machine: devices, parity with the installed MPE2, and that algorithms learn the probes.
 

@@ -17,7 +17,7 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
-    from gacrl.progress import TerminalWatcher
+    from gacrl.progress import RunsWatcher, TerminalWatcher
     from gacrl.training.session import Run, Watcher
 
 OVERVIEW = """\
@@ -30,6 +30,8 @@ usage: gacrl COMMAND [OPTIONS]
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
   render     watch a run, random, noop or oracle: a GIF
   compare    runs side by side: intervals over seeds, differences, what else differs
+  reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
+  sweep      the paper's grid of settings, and the spread that chance alone makes
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -122,7 +124,7 @@ def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
 
 
 @contextlib.contextmanager
-def _stopping(terminal: "TerminalWatcher") -> Generator[None]:
+def _stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
     """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
 
     def handler(number: int, frame: Any) -> None:
@@ -225,6 +227,45 @@ def _compare(words: list[str]) -> int:
     return 0
 
 
+def _reproduce(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Reproduce, words, "reproduce")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(max(asked.seeds, 1))
+    from gacrl.experiments import reproduce
+    from gacrl.progress import RunsWatcher
+
+    with RunsWatcher() as terminal, _stopping(terminal):
+        watch = reproduce.Watch(terminal.planned, terminal.watcher, terminal.finished, terminal.say)
+        done = reproduce.reproduce(asked.out, asked.seeds, asked.episodes, asked.extended, watch)
+    if done is None:
+        print(f"stopped; the same command goes on with what is missing in {asked.out}")
+        return terminal.exit_code
+    print(f"report     {done.report}")
+    if asked.json:
+        print(json.dumps(done.to_dict()))
+    return 0
+
+
+def _sweep(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Sweep, words, "sweep")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(27 * max(asked.seeds, 1))
+    from gacrl.experiments import sweep
+
+    grid = sweep.paper_grid(asked.seeds, asked.episodes)
+    done = sweep.sweep(grid, asked.out, say=lambda line: print(line, flush=True))
+    print(f"report     {done.report}")
+    if asked.json:
+        print(json.dumps(done.to_dict()))
+    return 0
+
+
 def _presets(words: list[str]) -> int:
     from gacrl import arguments
 
@@ -275,6 +316,8 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "evaluate": _evaluate,
     "render": _render,
     "compare": _compare,
+    "reproduce": _reproduce,
+    "sweep": _sweep,
     "presets": _presets,
     "config": _config,
     "doctor": _doctor,

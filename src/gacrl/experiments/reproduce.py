@@ -1,7 +1,7 @@
 """The paper's experiment: GACRL, QMIX, MAPPO and IPPO on the paper's schedule, several seeds of each.
 
 Every pair of column and algorithm is a run folder of its own, so that a stopped reproduction goes on with what
-is missing. What the runs showed is judged in `claims` and written down in `reproduce_report`.
+is missing. What the runs showed is judged in `comparisons` and written down in `reproduce_report`.
 """
 
 import json
@@ -15,7 +15,8 @@ from gacrl import config as configuration
 from gacrl.config import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.experiments import evidence, reproduce_report
-from gacrl.experiments.claims import Judged, judge_all
+from gacrl.experiments.claims import Judged
+from gacrl.experiments.comparisons import judge_all
 from gacrl.training import session
 from gacrl.training.loop import Diverged
 from gacrl.training.recorder import RunFolder
