@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gacrl import config as configuration
 from gacrl import envs
-from gacrl.config import EnvConfig, GacrlPaperConfig, RunConfig
+from gacrl.config import AlgorithmConfig, EnvConfig, GacrlPaperConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
@@ -49,7 +51,7 @@ def open_run(
     change: Callable[[EnvConfig], EnvConfig] = lambda env: env,
     warn: Callable[[str], None] = lambda sentence: None,
 ) -> TrainedRun:
-    """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0).
+    """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
 
     change: what to alter about the task. Raises UserError for a folder that holds no run, or parameters that
     do not fit the task.
@@ -57,7 +59,12 @@ def open_run(
     path, member = _split(str(run))
     folder = RunFolder.open(path)
     config = folder.config()
-    changed = replace(config, env=change(config.env), evaluation=replace(config.evaluation, horizon=None))
+    changed = replace(
+        config,
+        env=change(config.env),
+        evaluation=replace(config.evaluation, horizon=None),
+        algorithm=_without_experience(config.algorithm),
+    )
     if config.algorithm.name == GacrlPaperConfig.name and changed.env.num_agents != config.env.num_agents:
         raise UserError(
             f"{path} was trained with {config.env.num_agents} agents, and the paper's GACRL is built for their "
@@ -77,7 +84,49 @@ def open_run(
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
 
+class _Acting(NamedTuple):
+    """The part of a training state that acts, where a checkpoint of the whole has it."""
+
+    learner: Any
+
+
+def _without_experience(algorithm: AlgorithmConfig) -> AlgorithmConfig:
+    """The same, with no room for a replay: playing needs none, and it is most of a learner."""
+    return replace(algorithm, replay_capacity=1) if hasattr(algorithm, "replay_capacity") else algorithm
+
+
+def pretrained() -> dict[str, Path]:
+    """The policies that come with the package, by name."""
+    shipped = resources.files("gacrl") / "pretrained"
+    folders = [Path(str(entry)) for entry in shipped.iterdir()] if shipped.is_dir() else []
+    return {path.name: path for path in sorted(folders) if path.is_dir() and not path.name.startswith("_")}
+
+
+def save_policy(run: str | Path, out: Path) -> Path:
+    """Write the policy of a run's member (its first, for a folder) as a run folder without what only learning needs.
+
+    Raises UserError where `out` exists, or there is no such run.
+    """
+    if out.exists():
+        raise UserError(f"{out} exists: choose another folder")
+    path, member = _split(str(run))
+    opened = open_run(f"{path}@{member or 0}")
+    config = replace(RunFolder.open(path).config(), seed=opened.config.seed, num_seeds=1)
+    out.mkdir(parents=True)
+    (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
+    skip = tuple(f".learner{name}" for name in session.FOR_LEARNING)
+    state, fingerprint = _Acting(opened.learners), configuration.fingerprint(config)
+    checkpoint.save(out / "checkpoints", state, opened.env_steps, fingerprint, {}, skip)
+    return out
+
+
 def _split(run: str) -> tuple[Path, int | None]:
+    kind, colon, name = run.partition(":")
+    if colon and kind == "pretrained":
+        shipped = pretrained()
+        if name not in shipped:
+            raise UserError(configuration.unknown("pretrained policy", name, list(shipped)))
+        return shipped[name], None
     folder, at, member = run.rpartition("@")
     if at and member.isdigit() and not Path(run).exists():
         return Path(folder), int(member)

@@ -39,13 +39,23 @@ class Checkpoint(NamedTuple):
     """What the host loop needs to go on: seconds spent so far."""
 
 
-def save(folder: Path, state: PyTree, env_steps: int, fingerprint: str, counters: dict[str, Any]) -> Path:
-    """Write the state as the newest checkpoint in `folder` and drop the oldest beyond `KEPT`."""
+def save(
+    folder: Path,
+    state: PyTree,
+    env_steps: int,
+    fingerprint: str,
+    counters: dict[str, Any],
+    skip: tuple[str, ...] = (),
+) -> Path:
+    """Write the state as the newest checkpoint in `folder` and drop the oldest beyond `KEPT`.
+
+    skip: paths inside the state that are left out.
+    """
     target = folder / f"{_PREFIX}{env_steps:012d}"
     unfinished = folder / f".unfinished-{target.name}"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    tensors = safetensors.numpy.save(_to_arrays(state))
+    tensors = safetensors.numpy.save(_to_arrays(state, skip))
     manifest: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "env_steps": env_steps,
@@ -81,10 +91,11 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
     raise UserError(f"every checkpoint in {folder} {what}: train the run again into a new folder")
 
 
-def load(checkpoint: Checkpoint, like: Tree, prefix: str = "") -> Tree:
+def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, ...] = ()) -> Tree:
     """The saved state in the structure of `like` (arrays or their shapes).
 
-    prefix: the path of `like` inside the saved state, such as `.learner`. Raises UserError for a checkpoint
+    prefix: the path of `like` inside the saved state, such as `.learner`. skip: paths inside `like`, such as
+    `.replay`, that are not looked for and come as zeros. Raises UserError for a checkpoint
     of another architecture, naming the first array that differs.
     """
     path = checkpoint.folder / _TENSORS
@@ -93,7 +104,11 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "") -> Tree:
         leaves, structure = jax.tree_util.tree_flatten_with_path(like)
         loaded: list[Any] = []
         for key_path, leaf in leaves:
-            name = prefix + jax.tree_util.keystr(key_path)
+            inside = jax.tree_util.keystr(key_path)
+            if inside.startswith(skip):
+                loaded.append(jnp.zeros(leaf.shape, leaf.dtype))
+                continue
+            name = prefix + inside
             is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
             found = file.get_tensor(name) if name in saved else None
@@ -130,13 +145,14 @@ def _folders(folder: Path) -> list[Path]:
     return sorted(folder.glob(f"{_PREFIX}*"), reverse=True) if folder.is_dir() else []
 
 
-def _to_arrays(state: PyTree) -> dict[str, np.ndarray]:
+def _to_arrays(state: PyTree, skip: tuple[str, ...]) -> dict[str, np.ndarray]:
     def plain(leaf: jax.Array) -> np.ndarray:
         if _is_key(leaf):
             leaf = jax.random.key_data(leaf)
         return np.asarray(leaf, order="C")
 
-    return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
+    named = ((jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state))
+    return {name: plain(leaf) for name, leaf in named if not name.startswith(skip)}
 
 
 def _is_key(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:

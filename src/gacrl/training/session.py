@@ -242,9 +242,14 @@ def _member_shapes(trainer: Trainer) -> TrainState:
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
 
 
+FOR_LEARNING = (".replay", ".optimizer", ".rewards")
+"""What a learner holds that acting does not need."""
+
+
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
-    """The learners of a checkpoint, stacked and laid out for the trainer."""
-    learners = checkpoint.load(found, _stacked_shapes(trainer).learner, prefix=".learner")
+    """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
+    shapes = _stacked_shapes(trainer).learner
+    learners = checkpoint.load(found, shapes, prefix=".learner", skip=FOR_LEARNING)
     return shard_seeds(learners, trainer.num_seeds)
 
 
