@@ -166,6 +166,7 @@ class RunsWatcher:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._note = None  # what is going on is over; the table of the runs stays
         self._live.stop()
 
     def request_stop(self, exit_code: int) -> None:
