@@ -31,7 +31,7 @@ ALGORITHMS: Mapping[str, str] = MappingProxyType(
 """The paper's names, and the presets that train them."""
 
 _PPO: dict[str, Any] = {
-    "training": {"num_envs": 15, "num_steps": 25},
+    "training": {"num_envs": 10, "num_steps": 25},
     "algorithm": {
         "num_minibatches": 4,
         "update_epochs": 6,
