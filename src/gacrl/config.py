@@ -8,7 +8,7 @@ import difflib
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
@@ -67,8 +67,11 @@ class EnvConfig:
     """Speed of the landmarks, as a share of an agent's top speed."""
     coverage_threshold: float = 0.5
     """θ of the paper: its coverage bonus, and the coverage that exploration follows."""
-    reward: Literal["mpe2", "paper"] = "mpe2"
-    """What the learner earns: MPE2's reward, or the paper's shaped one, equation (1)."""
+    reward: Literal["mpe2", "paper", "coverage"] = "mpe2"
+    """What the learner earns: MPE2's reward, the paper's shaped one (equation 1), or MPE2's and a bonus for every
+    step in which a landmark is covered within 0.1. Metrics are always of MPE2's."""
+    coverage_bonus: float = 0.5
+    """Of reward coverage: what a step with every landmark covered adds."""
     collision_term: Literal["per_agent", "once"] = "per_agent"
     """Equation (1)'s collision term inside the sum over agents, or once."""
     collision_distance: float = 0.2
@@ -85,6 +88,7 @@ class EnvConfig:
         _between("env", self, 0.0, 1.0, "local_ratio")
         _between("env", self, 0.001, 1000.0, "arena_scale", "coverage_threshold")
         _between("env", self, 0.0, 10.0, "landmark_speed", "collision_distance", "reset_distance")
+        _between("env", self, 0.0, 1000.0, "coverage_bonus")
 
     @property
     def landmarks(self) -> int:
@@ -525,26 +529,28 @@ _IQL = _baseline("iql", _q("iql"), _OFF_POLICY)
 _COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds=2), _ON_POLICY)
 _DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
 
-_GACRL_NETWORK = NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete")
 _GACRL_112K = RunConfig(
     algorithm=GacrlConfig(
-        network=_GACRL_NETWORK,
-        learning_rate=2e-3,
+        network=NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete"),
+        learning_rate=1e-3,
         learning_rate_end=1e-4,
         n_step=3,
         augment=True,
+        epsilon_end=0.02,
         replay_capacity=120_000,
         learning_starts=500,
         updates=10,
     ),
-    env=EnvConfig(max_cycles=75),
+    env=EnvConfig(max_cycles=75, reward="coverage"),
     training=TrainingConfig(env_steps=112_500, num_envs=5, num_steps=5),
     evaluation=EvaluationConfig(interval=7_500),
     preset="gacrl-112k",
 )
+_GACRL = replace(_GACRL_112K, env=replace(_GACRL_112K.env, max_cycles=25), preset="gacrl")
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
+        "gacrl": ("GACRL that solves the task: 25 steps, in about two minutes", _GACRL),
         "gacrl-112k": ("GACRL that solves the task, on the paper's budget of 112,500 steps", _GACRL_112K),
         "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
         "vdn": ("VDN: the same learner, values summed", _VDN),
@@ -593,7 +599,7 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
         if name not in ALGORITHMS:
             raise ConfigError(unknown("algorithm", name, ALGORITHMS))
         if name != base.algorithm.name:
-            base = dataclasses.replace(base, algorithm=ALGORITHMS[name]())
+            base = replace(base, algorithm=ALGORITHMS[name]())
         data["algorithm"] = settings
     return _merge(base, data, "")
 
@@ -651,7 +657,7 @@ def _merge(settings: Any, data: Mapping[str, Any], where: str) -> Any:
             changes[key] = _merge(current, value, f"{where}{key}.")  # pyright: ignore[reportUnknownArgumentType]
         else:
             changes[key] = _coerce(value, hints[key], where + key)
-    return dataclasses.replace(settings, **changes)
+    return replace(settings, **changes)
 
 
 def _coerce(value: Any, hint: Any, where: str) -> Any:

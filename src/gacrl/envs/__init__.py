@@ -15,6 +15,7 @@ def make(config: EnvConfig) -> Spread:
         initial_params=SpreadParams(
             local_ratio=config.local_ratio,
             coverage_threshold=config.coverage_threshold,
+            coverage_bonus=config.coverage_bonus,
             arena_scale=config.arena_scale,
             landmark_speed=config.landmark_speed,
             reset_distance=config.reset_distance,

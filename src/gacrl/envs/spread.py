@@ -32,7 +32,7 @@ NEAR_DISTANCE = 0.2
 REPORTED_LOCAL_RATIO = 0.5
 """`reward_raw` is always taken at MPE2's default, whatever the learner is trained on."""
 
-RewardKind = Literal["mpe2", "paper"]
+RewardKind = Literal["mpe2", "paper", "coverage"]
 CollisionReset = Literal["off", "truncate", "in_place"]
 
 
@@ -46,6 +46,8 @@ class SpreadParams(NamedTuple):
     """0 is the first stage of MPE2's `curriculum`."""
     coverage_threshold: Float[Array, ""] | float = 0.5
     """θ of equation (1), of adaptive exploration and of the metric `coverage_theta`."""
+    coverage_bonus: Float[Array, ""] | float = 0.5
+    """Of the reward `coverage`: what a step with every landmark covered adds."""
     arena_scale: Float[Array, ""] | float = 1.0
     """Agents and landmarks start uniformly in [−arena_scale, arena_scale]²."""
     landmark_speed: Float[Array, ""] | float = 0.0
@@ -128,6 +130,8 @@ class Spread:
             reward = jnp.broadcast_to(info["reward_shaped"], (self.num_agents,))
         else:
             reward = self.rewards(state, params)
+        if self.reward == "coverage":
+            reward += params.coverage_bonus * info[f"coverage_{CAPTURE_RADIUS}"]
         if params.agent_mask is not None:
             reward = jnp.where(params.agent_mask, reward, 0.0)
 
