@@ -7,6 +7,7 @@ are a set with which an agent can stop anywhere; with full pushes alone it stops
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
@@ -39,7 +40,11 @@ def choices(env: Environment) -> ActionSet:
     if spatial is None:
         becomes = np.arange(len(table))[None]
     else:
-        turned = [np.asarray(spatial.turn_action(jnp.asarray(table), jnp.asarray(g))) for g in range(8)]
+        with jax.ensure_compile_time_eval():  # also where a program that uses it is being traced
+            turned = [
+                np.asarray(spatial.turn_action(jnp.asarray(table), jnp.asarray(g)))
+                for g in range(spatial.num_symmetries)
+            ]
         becomes = np.stack([np.abs(rows[:, None] - table).sum(-1).argmin(-1) for rows in turned])
     return ActionSet(
         size=len(table),

@@ -1,0 +1,165 @@
+"""GACRL: the team's value, execution without a centre, exploration that follows coverage, pushes for actions."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gacrl import config as configuration
+from gacrl.algorithms import algorithm as algorithms
+from gacrl.algorithms import gacrl
+from gacrl.algorithms.actions import STRENGTHS, choices
+from gacrl.algorithms.exploration import EXPLORING, GREEDY, UNSETTLED, Follower, adaptive
+from gacrl.algorithms.q_learning import Network
+from gacrl.config import NetworkConfig, TrainingConfig
+from gacrl.envs.spread import Spread
+from gacrl.networks.agent import AgentNetwork
+from gacrl.networks.layers import Linear, Mlp
+from gacrl.networks.messages import most_likely_symbol
+from gacrl.training.curriculum import constant
+from gacrl.training.trainer import Trainer
+from gacrl.types import Channel, Decision, Transition
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+ENV = Spread(num_agents=4, num_landmarks=3)
+TALKING = NetworkConfig(
+    torso="graph", width=8, latent="vae", latent_size=3, communication="discrete", vocabulary=4
+)
+SMALL = replace(
+    configuration.preset("gacrl").algorithm,
+    network=TALKING,
+    replay_capacity=60,
+    learning_starts=10,
+    batch_size=4,
+    updates=1,
+)
+TRAINING = TrainingConfig(env_steps=100, num_envs=2, num_steps=5)
+
+
+def test_the_teams_value_is_the_critics_less_what_each_agent_falls_short():
+    key = jax.random.key(0)
+    _, seen = ENV.reset(key)
+    agent = AgentNetwork(ENV, TALKING, 5, key)
+    network = Network(agent, (Mlp(8, (8,), key), Linear(8, 1, key)))
+    output, _ = agent(seen)
+    best = output.head.argmax(-1)
+    layers, head = network.team
+    value = head(layers(output.hidden.mean(0)))
+    np.testing.assert_allclose(gacrl.central(choices(ENV), network, output, best, seen), value, rtol=1e-5)
+    worse = best.at[1].set(output.head[1].argmin())
+    short = output.head[1].max() - output.head[1].min()
+    found = gacrl.central(choices(ENV), network, output, worse, seen)
+    np.testing.assert_allclose(found, value - short, rtol=1e-5)
+
+    padded = seen._replace(agent_mask=jnp.array([True, False, True, True]))
+    value = head(layers(output.hidden[jnp.array([0, 2, 3])].mean(0)))
+    found = gacrl.central(choices(ENV), network, output, worse, padded)
+    np.testing.assert_allclose(found, value, rtol=1e-5, err_msg="who is not there counts nothing")
+
+
+def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():
+    """By itself, with its own observation and its neighbours' symbols, an agent computes what the team's program does."""
+    key = jax.random.key(1)
+    _, seen = ENV.reset(key)
+    network = AgentNetwork(ENV, replace(TALKING, rounds=2), 5, key)
+    together, _ = network(seen)
+    talk, code = network.communication, network.code
+    assert code is not None
+
+    def alone(agent: int):
+        """What one agent knows before anything is said: all other rows are noise."""
+        features = jax.random.normal(key, seen.features.shape).at[agent].set(seen.features[agent])
+        hidden = network.torso(seen._replace(features=features))[agent][None]
+        z, hidden, _ = code(hidden, None)
+        return z, hidden
+
+    states = [alone(agent) for agent in range(4)]
+    source, hidden = [z for z, _ in states], [h for _, h in states]
+    positions = np.asarray(seen.positions)
+    for number in range(2):
+        told = [most_likely_symbol(talk.encode[number](x))[0] for x in source]
+        after = []
+        for i in range(4):
+            near = [j for j in range(4) if j != i and np.linalg.norm(positions[i] - positions[j]) < 1.5]
+            heard = jnp.zeros(4)
+            if near:
+                offsets = jnp.asarray(positions[near] - positions[i])
+                where = jnp.concatenate([offsets, jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)], -1)
+                edges = talk.edge[number](jnp.concatenate([jnp.stack([told[j] for j in near]), where], -1))
+                receiver = jnp.broadcast_to(hidden[i], (len(near), 8))
+                score = talk.attention[number](jnp.concatenate([receiver, edges], -1))[:, 0]
+                heard = jax.nn.softmax(score) @ edges
+            merged = talk.merge[number](jnp.concatenate([hidden[i], heard[None]], -1))
+            after.append(hidden[i] + jax.nn.relu(merged))
+        source = hidden = after
+    np.testing.assert_allclose(network.head(jnp.concatenate(hidden)), together.head, rtol=1e-4, atol=1e-5)
+
+
+def test_exploration_follows_what_greedy_episodes_cover():
+    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2", memory=0.5)
+    assert rule.level(Follower(jnp.zeros(())), jnp.asarray(0)) == (1.0, 2.0)
+    np.testing.assert_allclose(rule.level(Follower(jnp.asarray(0.5)), jnp.asarray(9)), (0.325, 0.875))
+    np.testing.assert_allclose(rule.level(Follower(jnp.asarray(1.0)), jnp.asarray(0)), (0.1, 0.5), rtol=1e-6)
+
+    # Two of the three environments end; only the first played greedily.
+    steps = Transition(
+        observation=None,  # pyright: ignore[reportArgumentType] not looked at
+        decision=Decision(jnp.zeros((1, 3, 1), int), extras={"mode": jnp.array([[GREEDY, EXPLORING, GREEDY]])}),
+        reward=jnp.zeros((1, 3, 1)),
+        terminated=jnp.zeros((1, 3), bool),
+        truncated=jnp.array([[True, True, False]]),
+        first=jnp.zeros((1, 3), bool),
+        next_observation=None,  # pyright: ignore[reportArgumentType]
+        info={"coverage_0.2": jnp.array([[0.8, 0.2, 0.4]])},
+    )
+    np.testing.assert_allclose(rule.follow(Follower(jnp.asarray(0.2)), steps).coverage, 0.2 + 0.5 * 0.6)
+    unmeasured = steps._replace(info={})
+    assert rule.follow(Follower(jnp.asarray(0.2)), unmeasured).coverage == jnp.float32(0.2)
+
+
+def test_an_episode_is_settled_once():
+    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2")
+    keys = jax.random.split(jax.random.key(0), 4_000)
+    modes, epsilons = jax.vmap(lambda key: rule.begin(jnp.asarray(UNSETTLED), key, jnp.asarray(0.6)))(keys)
+    assert abs((modes == GREEDY).mean() - 0.25) < 0.03
+    np.testing.assert_allclose(epsilons, jnp.where(modes == GREEDY, 0.0, 0.6))
+    again, _ = jax.vmap(lambda key, mode: rule.begin(mode, key, jnp.asarray(0.6)))(keys[::-1], modes)
+    np.testing.assert_array_equal(again, modes)
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_it_learns_from_its_replay_and_acts_as_the_task_wants(continuous: bool):
+    env = Spread(num_agents=2, num_landmarks=2, max_cycles=4, continuous_actions=continuous)
+    algorithm = algorithms.make(SMALL, env, TRAINING)
+    trainer = Trainer(algorithm, env, constant(), TRAINING.num_envs, TRAINING.num_steps)
+    before = trainer.init((0,))
+    weights = np.asarray(jax.tree.leaves(before.learner.network)[0])
+    state, report = trainer.chunk(before, 4)
+    assert all(np.isfinite(value).all() for value in report.metrics.values())
+    assert (np.asarray(jax.tree.leaves(state.learner.network)[0]) != weights).any()
+    assert report.metrics["loss_code"] > 0
+
+    learner = jax.tree.map(lambda leaf: leaf[0], state.learner)
+    _, seen = env.reset(jax.random.key(0))
+    decision, _ = algorithm.policy(learner, True)(trainer.memory, seen, jax.random.key(1), Channel())
+    np.testing.assert_array_equal(decision.message.sum(-1), 1.0)
+    if continuous:
+        assert decision.action.shape == (2, 5)
+        assert set(np.unique(decision.action)) <= {0.0, 1.0, *STRENGTHS}
+    else:
+        assert decision.action.shape == (2,)
+
+
+def test_pushes_turn_with_the_world():
+    env = Spread(num_agents=1, num_landmarks=1, continuous_actions=True)
+    pushes = choices(env)
+    assert pushes.size == 1 + 4 * len(STRENGTHS)
+    everything = jnp.arange(pushes.size)
+    for symmetry in range(8):
+        turned = pushes.turn(everything, jnp.asarray(symmetry))
+        assert sorted(turned.tolist()) == everything.tolist()
+        expected = env.turn_action(pushes.act(everything), jnp.asarray(symmetry))
+        np.testing.assert_allclose(pushes.act(turned), expected)
