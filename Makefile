@@ -6,8 +6,8 @@ STAMP := .venv/.installed
 
 .PHONY: train test soak lint types bench clean
 
-train: $(STAMP)  ## a short run of the default preset: where its summary and GIF lie is printed at the end
-	"$(BIN)/gacrl" train --env-steps 15000
+train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
+	"$(BIN)/gacrl" train
 
 test: $(STAMP)
 	"$(BIN)/python" -m pytest -n 2 --dist loadgroup

@@ -178,7 +178,7 @@ def test_no_number_is_beyond_all_bounds(path: str):
         beyond += [-0.001, math.nan, math.inf, -math.inf]
     for value in beyond:
         with pytest.raises(ConfigError) as refused:
-            from_dict(nested(path, value))
+            from_dict(nested(path, value), UNUSUAL)
         assert path in str(refused.value)
         assert "must" in str(refused.value)
 
@@ -195,7 +195,7 @@ def test_settings_made_in_python_are_checked_too():
     with pytest.raises(ConfigError, match="must not exceed 1, a probability"):
         GacrlPaperConfig(epsilon=0.9)
     with pytest.raises(ConfigError, match="discrete actions"):
-        RunConfig(env=EnvConfig(continuous_actions=True))
+        RunConfig(algorithm=GacrlPaperConfig(), env=EnvConfig(continuous_actions=True))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Every command and every line of Python in the README works, word for word.
 
-The `paper` preset is a small one here; nothing else is changed.
+The presets are small ones here; nothing else is changed.
 """
 
 import re
@@ -31,15 +31,22 @@ pytestmark = pytest.mark.xdist_group("readme")
 @pytest.fixture(scope="module")
 def room(tmp_path_factory, quick_start):
     """A folder to work in, in which the paper's schedule is short."""
-    paper = config.PRESETS["paper"][1]
-    short = replace(
-        paper,
-        env=replace(paper.env, max_cycles=5),
-        training=replace(paper.training, env_steps=500),
-        evaluation=replace(paper.evaluation, interval=250, num_episodes=4, final_episodes=8),
-    )
+
+    def short(preset: config.RunConfig) -> config.RunConfig:
+        algorithm = preset.algorithm
+        if isinstance(algorithm, config.GacrlConfig):
+            algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500)
+        return replace(
+            preset,
+            algorithm=algorithm,
+            env=replace(preset.env, max_cycles=5),
+            training=replace(preset.training, env_steps=500),
+            evaluation=replace(preset.evaluation, interval=250, num_episodes=4, final_episodes=8),
+        )
+
+    presets = {name: ("short", short(config.preset(name))) for name in ("paper", "gacrl")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(config, "PRESETS", MappingProxyType({"paper": ("short", short)}))
+        patch.setattr(config, "PRESETS", MappingProxyType(presets))
         patch.chdir(tmp_path_factory.mktemp("readme"))
         yield
 

@@ -24,9 +24,9 @@ class Train:
     Settings come from the preset, then --config, then the flags below.
 
     examples:
-      gacrl train                                     the default preset
+      gacrl train                                     GACRL that solves the task, about two minutes
       gacrl train --preset paper --num-seeds 2        the paper's whole schedule, a seed on each core
-      gacrl train --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
+      gacrl train --preset paper --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
       gacrl train --config my.json --seed 7           `gacrl config` prints such a file
     """
 

@@ -38,8 +38,8 @@ usage: gacrl COMMAND [OPTIONS]
 
 `gacrl COMMAND --help` explains a command, with examples. Some to begin with:
 
-  gacrl train --preset paper --env-steps 15000
-  gacrl evaluate runs/paper-1 --backend mpe2
+  gacrl train
+  gacrl evaluate runs/gacrl-1 --backend mpe2
   gacrl render oracle --out oracle.gif
 """
 

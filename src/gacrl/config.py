@@ -432,12 +432,12 @@ class EvaluationConfig:
 class RunConfig:
     """Everything that determines a run."""
 
-    algorithm: AlgorithmConfig = field(default_factory=GacrlPaperConfig)
+    algorithm: AlgorithmConfig = field(default_factory=GacrlConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    preset: str = "paper"
+    preset: str = "gacrl"
     """The preset that this started from."""
     seed: int = 0
     """Seed of the first member."""
@@ -562,7 +562,7 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
         "paper": ("the paper's GACRL as printed: 1,500 episodes of 75 steps, an update every step", _PAPER),
     }
 )
-DEFAULT_PRESET = "paper"
+DEFAULT_PRESET = "gacrl"
 
 
 def preset(name: str = DEFAULT_PRESET) -> RunConfig:
