@@ -1,20 +1,21 @@
-"""What the paper's algorithm learns on tasks with known answers, and what its printed KL weight keeps it from."""
+"""What each algorithm learns on tasks with known answers; and what the paper's printed KL weight keeps it from."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from gacrl.config import GacrlPaperConfig
+from gacrl.config import GacrlPaperConfig, IppoConfig, MappoConfig, NetworkConfig, PpoConfig, QmixConfig
 from gacrl.doctor import BEYOND
 from gacrl.envs.probes import BEST_RETURN, PROBES
 from gacrl.training.probing import ProbeResult, probe_algorithm
 
-pytestmark = pytest.mark.xdist_group("probing")  # all but the soak shares one compiled program
+pytestmark = pytest.mark.xdist_group("probing")  # the paper's share one compiled program
 
 
 @pytest.fixture(scope="module")
 def printed() -> ProbeResult:
-    """Half of what `gacrl doctor` gives it; a third was enough for each of six seeds."""
+    """As long as `gacrl doctor`; a thousand updates were enough for each of six seeds."""
     return probe_algorithm(GacrlPaperConfig(), 1_500)
 
 
@@ -36,8 +37,72 @@ def test_what_cannot_be_acted_on_brings_what_chance_does(printed: ProbeResult):
     assert set(printed.returns) == set(PROBES)
     assert printed.returns["value"] == 1.0
     assert abs(printed.returns["observation"]) < 0.5
-    assert BEYOND["gacrl_paper"] == ("message",)
+    assert BEYOND["paper"] == ("message",)
     assert abs(printed.returns["message"]) < 0.5
+
+
+def ppo(kind: type[PpoConfig], **network: Any) -> Any:
+    settings = NetworkConfig(width=16, depth=1, **network)
+    return kind(network=settings, learning_rate=1e-2, update_epochs=4, num_minibatches=1)
+
+
+def q_learning(mixer: Any, **settings: Any) -> QmixConfig:
+    """Everything at random: the replay then shows every action in every place."""
+    return QmixConfig(
+        mixer=mixer,
+        mixer_width=8,
+        learning_rate=1e-2,
+        learning_starts=0,
+        replay_capacity=6_400,
+        batch_size=32,
+        updates=4,
+        target_step=0.05,
+        epsilon_end=1.0,
+        **{"network": NetworkConfig(width=16, depth=1)} | settings,
+    )
+
+
+DIAL = NetworkConfig(width=16, depth=1, communication="dial", vocabulary=2)
+BASELINES = {
+    "mappo": (ppo(MappoConfig), 60),
+    "ippo": (ppo(IppoConfig), 60),
+    "commnet": (ppo(IppoConfig, communication="commnet"), 60),
+    "qmix": (q_learning("qmix"), 100),
+    "vdn": (q_learning("vdn"), 100),
+    "iql": (q_learning("iql"), 100),
+    "dial": (q_learning("vdn", network=DIAL, sequence_length=2), 150),
+}
+SOLVED = {"commnet": ("message", "late_message"), "dial": ("late_message",)}
+"""Of the probes that take a message: DIAL's is heard a step after it was said."""
+
+
+TWINS = ("ippo", "vdn")
+"""Commnet without its channel, and DIAL: what they learn is soaked, and seen by the doctor."""
+
+
+@pytest.mark.usefixtures("quick_start")
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.soak) if name in TWINS else name for name in BASELINES]
+)
+def test_a_baseline_learns_what_it_can(name: str):
+    """To act, to tell what will come a step later (γ = 0.95), and to talk where it has a channel, not where not.
+
+    A value is a decision's: PPO's of the first agent, the team's of the mixers, and of IQL the mean over the agents,
+    where the blind one expects nothing of what the other sees or does.
+    """
+    algorithm, updates = BASELINES[name]
+    found = probe_algorithm(algorithm, updates, num_envs=64)
+    assert found.returns["action"] == found.returns["both"] == found.returns["discount"] == 1.0
+    for probe in ("message", "late_message"):
+        if probe in SOLVED.get(name, ()):
+            assert found.returns[probe] == BEST_RETURN[probe] == 1.0
+        else:
+            assert abs(found.returns[probe]) < 0.5
+            assert name == "dial" or "message" in BEYOND[name]
+    share = 0.5 if name == "iql" else 1.0
+    assert found.values["value"] == pytest.approx((1.0, 1.0), abs=0.1)
+    assert found.values["discount"] == pytest.approx((0.95, 0.95), abs=0.1)
+    assert found.values["observation"] == pytest.approx((-share, share), abs=0.15)
 
 
 @pytest.mark.soak

@@ -10,17 +10,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.environment import TimeStep
 from gacrl.types import Observation, PRNGKey
 
-PROBES = ("value", "observation", "discount", "action", "both", "message")
+PROBES = ("value", "observation", "discount", "action", "both", "message", "late_message")
 """In this order: a constant reward to predict; one that the observation tells; one that comes a step later;
-one that the first agent's action brings; one that it brings by matching the observation; and one that the
-second agent must match to what only the first one sees."""
+one that the first agent's action brings; one that it brings by matching the observation; one that the second
+agent must match to what only the first one sees, at once; and the same at a second step, where what is heard a
+step after it was said is in time, too."""
 
-BEST_RETURN = {"action": 1.0, "both": 1.0, "message": 1.0}
+BEST_RETURN = {"action": 1.0, "both": 1.0, "message": 1.0, "late_message": 1.0}
 """What acting well brings, in the probes in which acting matters; acting at random brings 0."""
 
 
@@ -61,8 +62,8 @@ class Probe:
     ) -> tuple[ProbeState, TimeStep]:
         params = self.default_params() if params is None else params
         choice = 2.0 * action - 1.0  # the two actions, as −1 and 1
-        is_discount = params.probe == PROBES.index("discount")
-        last = (state.clock == 1) | jnp.logical_not(is_discount)  # the others take a single step
+        two_steps = _is(params, "discount") | _is(params, "late_message")
+        last = (state.clock == 1) | jnp.logical_not(two_steps)
         reward = jnp.stack(
             [
                 jnp.ones(()),
@@ -71,6 +72,7 @@ class Probe:
                 choice[0],
                 choice[0] * state.sign,
                 choice[1] * state.sign,
+                choice[1] * state.sign * last,
             ]
         )[params.probe]
         state = state._replace(clock=state.clock + 1)
@@ -81,8 +83,8 @@ class Probe:
 
     def observe(self, state: ProbeState, params: ProbeParams) -> Observation:
         """The first agent sees the sign, where there is something to see, and the clock; the second nothing."""
-        blind = (params.probe == PROBES.index("value")) | (params.probe == PROBES.index("discount"))
-        seen = jnp.where(blind | (params.probe == PROBES.index("action")), 0.0, state.sign)
+        blind = _is(params, "value") | _is(params, "discount") | _is(params, "action")
+        seen = jnp.where(blind, 0.0, state.sign)
         features = jnp.zeros((self.num_agents, self.observation_size))
         features = features.at[0].set(jnp.stack([seen, state.clock.astype(float)]))
         everyone = jnp.ones(self.num_agents, bool)
@@ -93,3 +95,7 @@ class Probe:
             landmark_mask=jnp.ones(self.num_landmarks, bool),
             action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
         )
+
+
+def _is(params: ProbeParams, probe: str) -> Bool[Array, ""]:
+    return jnp.asarray(params.probe == PROBES.index(probe))

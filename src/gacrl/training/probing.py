@@ -29,6 +29,7 @@ def probe_algorithm(
     num_updates: int,
     num_envs: int = 1,
     num_steps: int = 1,
+    *,
     seed: int = 0,
     probes: tuple[str, ...] = PROBES,
 ) -> ProbeResult:
