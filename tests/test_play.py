@@ -171,3 +171,20 @@ def test_an_environment_is_made_by_its_settings():
         gacrl.ConfigError, match=r"unknown setting 'env.num_agent': did you mean 'env.num_agents'?"
     ):
         gacrl.make_env("spread", num_agent=5)
+
+
+def test_a_policy_is_saved_without_what_only_learning_needs(run: Path, observations: np.ndarray, tmp_path: Path):
+    saved = play.save_policy(f"{run}@1", tmp_path / "policy")
+    whole = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+    assert sum(path.stat().st_size for path in saved.rglob("*") if path.is_file()) < 0.25 * whole
+    mine, theirs = gacrl.load_policy(saved), gacrl.load_policy(f"{run}@1")
+    for seen in observations[:8]:
+        np.testing.assert_array_equal(mine(seen), theirs(seen))
+        np.testing.assert_array_equal(mine.message, theirs.message)
+    with pytest.raises(gacrl.UserError, match="exists: choose another folder"):
+        play.save_policy(run, saved)
+
+
+def test_pretrained_policies_have_names():
+    with pytest.raises(gacrl.UserError, match="unknown pretrained policy 'nobody'"):
+        gacrl.load_policy("pretrained:nobody")

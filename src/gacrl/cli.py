@@ -142,7 +142,7 @@ def _stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
 def _base_settings(words: list[str]) -> RunConfig:
     """The settings under the flags: the preset's, then those of --config; both change what --help shows."""
     named: dict[str, str] = {}
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in zip(words, [*words[1:], ""], strict=False):
         flag, _, value = word.partition("=")
         if flag in ("--preset", "--config"):
             named[flag] = value or following
