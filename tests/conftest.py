@@ -93,7 +93,18 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
 
     folder = tmp_path_factory.mktemp("tiny") / "run"
     words = [
-        *("--preset", "paper", "--env-steps", "450", "--evaluation.interval", "60", "--num-seeds", "2", "--seed", "5"),
+        *(
+            "--preset",
+            "paper",
+            "--env-steps",
+            "450",
+            "--evaluation.interval",
+            "60",
+            "--num-seeds",
+            "2",
+            "--seed",
+            "5",
+        ),
         *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", "8"),
         *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
     ]

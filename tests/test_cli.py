@@ -114,7 +114,11 @@ def flip_a_byte(path: Path) -> None:
         ("train --env-steps 0", "training.env_steps", "at least 1|between 1 and"),
         ("train --episodes 0", "training.env_steps", "at least 1|between 1 and"),
         ("train --episodes 1 --env-steps 9", "--env-steps and --episodes", "give one of them"),
-        ("train --preset paper --env.continuous-actions", "needs discrete actions", "leave env.continuous_actions at False"),
+        (
+            "train --preset paper --env.continuous-actions",
+            "needs discrete actions",
+            "leave env.continuous_actions at False",
+        ),
         ("train --out /dev/null/run", "/dev/null/run", "choose another with --out"),
         ("train --config none.json", "none.json", "gacrl config"),
         ("resume nowhere", "there is no run nowhere", "gacrl train"),

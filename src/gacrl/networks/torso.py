@@ -78,9 +78,7 @@ class GraphTorso(eqx.Module):
         contest = _pool_max(rivals, agent_there[:, None, :], axis=2)
 
         # Landmark → agent, and agent → agent.
-        places = self.landmark(
-            jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1)
-        )
+        places = self.landmark(jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1))
         score = jnp.where(landmark_there, self.attention(places)[..., 0], -jnp.inf)
         chosen = _pool_softmax(places, score)
         best = _pool_max(places, landmark_there, axis=1)
