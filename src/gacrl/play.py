@@ -115,7 +115,7 @@ def save_policy(run: str | Path, out: Path) -> Path:
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
     skip = tuple(f".learner{name}" for name in session.FOR_LEARNING)
-    state, fingerprint = _Acting(opened.learners), configuration.fingerprint(config)
+    state, fingerprint = _Acting(jax.tree.map(jnp.asarray, opened.learners)), configuration.fingerprint(config)
     checkpoint.save(out / "checkpoints", state, opened.env_steps, fingerprint, {}, skip)
     return out
 
