@@ -1,8 +1,8 @@
 """Q-learning of a team from replay, shared by QMIX, VDN, IQL and GACRL: they pass what is theirs in `Parts`.
 
 Top to bottom: what a learner passes, what is remembered, how agents act, the loss, one update. Double Q-learning
-(van Hasselt et al. 2016), n-step targets, a target network that follows slowly. Messages and recurrent memories
-are not remembered as data but made anew by the network that is learning.
+(van Hasselt et al. 2016), n-step targets, a target network that follows slowly. Messages are not
+remembered but made anew by the network that is learning; of memories, the one at the start of a window is.
 """
 
 from collections.abc import Callable
