@@ -103,7 +103,7 @@ def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any
     """`function(member, *shared)` for one seed, as a function of the stacked seeds.
 
     Seeds are sharded over the devices. Within one device they take turns: on a CPU, mapping them instead makes
-    every small matrix product a batch of them, and took 2.4 times as long (the paper's schedule, three seeds a core).
+    every small matrix product a batch of them, and gains nothing (docs/design.md).
     """
     devices = devices_for(num_seeds)
     mesh = Mesh(np.asarray(devices), ("seeds",))
