@@ -123,7 +123,7 @@ def unroll(
     """
     if not isinstance(memory, AgentMemory):
         return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
-    fresh = network.initial_memory(first_axis(observations))
+    fresh = network.initial_memory(observations.features.shape[-2])
 
     def step(memory: Memory, inputs: tuple[Observation, Bool[Array, ""], Any]):
         seen, first, key = inputs
@@ -132,11 +132,6 @@ def unroll(
         return memory, (output, memory)
 
     return jax.lax.scan(step, memory, (observations, first, keys))[1]
-
-
-def first_axis(observations: Observation) -> int:
-    """N of observations [T, N, O]."""
-    return observations.features.shape[-2]
 
 
 def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> NetworkConfig:

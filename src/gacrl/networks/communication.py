@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gacrl.config import NetworkConfig
+from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, transmit
 from gacrl.types import Channel, PRNGKey
@@ -156,8 +157,7 @@ class Symbols(Silence):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        length = jnp.sqrt(jnp.square(near.offsets).sum(-1, keepdims=True) + 1e-8)
-        where = jnp.concatenate([near.offsets, length], axis=-1)
+        where = with_length(near.offsets)
         num_agents, message, entropy = hidden.shape[0], None, jnp.zeros(hidden.shape[0])
         for number, (encode, edge, attention, merge) in enumerate(
             zip(self.encode, self.edge, self.attention, self.merge, strict=True)
@@ -173,7 +173,7 @@ class Symbols(Silence):
             received = edge(jnp.concatenate([_received(message, channel, key), where], axis=-1))  # [N N H/2]
             receiver = jnp.broadcast_to(hidden[:, None, :], (num_agents, num_agents, hidden.shape[-1]))
             score = attention(jnp.concatenate([receiver, received], axis=-1))[..., 0]
-            heard = _weighted(received, jnp.where(near.adjacency, score, -jnp.inf))
+            heard = attend(received, jnp.where(near.adjacency, score, -jnp.inf))
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
         return Spoken(hidden, message, (), entropy)
 
@@ -208,10 +208,3 @@ def _mean(received: Float[Array, "N N V"], adjacency: Bool[Array, "N N"]) -> Flo
     """Over each agent's neighbours; 0 for an agent without any."""
     weight = adjacency / jnp.maximum(adjacency.sum(1, keepdims=True), 1)
     return jnp.einsum("ij,ijv->iv", weight, received)
-
-
-def _weighted(received: Float[Array, "N N V"], score: Float[Array, "N N"]) -> Float[Array, "N V"]:
-    """The mean weighted by the softmax of the scores; 0 for an agent without neighbours."""
-    largest = jax.lax.stop_gradient(jnp.max(score, axis=1, keepdims=True, initial=-1e9))
-    weight = jnp.exp(score - largest)
-    return jnp.einsum("ij,ijv->iv", weight, received) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)

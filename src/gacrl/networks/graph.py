@@ -1,5 +1,6 @@
-"""Who can hear whom, and sums over the neighbourhood."""
+"""Who can hear whom, where they stand, and sums over the neighbourhood."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -38,3 +39,16 @@ def neighbour_sum(
     if channel.edge_keep is not None:
         weights *= channel.edge_keep
     return messages @ weights.T
+
+
+def with_length(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
+    """The offset and its length; finite gradients at 0."""
+    length = jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)
+    return jnp.concatenate([offsets, length], axis=-1)
+
+
+def attend(values: Float[Array, "N M H"], score: Float[Array, "N M"]) -> Float[Array, "N H"]:
+    """The mean over M, weighted by the softmax of the score; 0 where every score is −∞ (nobody is there)."""
+    largest = jax.lax.stop_gradient(jnp.max(score, axis=1, keepdims=True, initial=-1e9))
+    weight = jnp.exp(score - largest)
+    return jnp.einsum("nm,nmh->nh", weight, values) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from gacrl.config import NetworkConfig
 from gacrl.envs.environment import Environment, SpatialEnvironment
+from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.types import Entities, Observation, PRNGKey
 
@@ -72,7 +73,7 @@ class GraphTorso(eqx.Module):
         agents, agent_there = _nearest(seen.agents, self.nearest_agents)  # [N M 2]
 
         # Agent → landmark, in the agent's own frame: where each rival stands from each landmark, and where I do.
-        between = _scales(agents[:, None, :, :] - landmarks[:, :, None, :])  # [N L M 3]
+        between = _scales(agents[:, None, :, :] - landmarks[:, :, None, :])  # [N L M 5]
         mine = jnp.broadcast_to(_scales(-landmarks)[:, :, None, :], between.shape)
         rivals = self.rival(jnp.concatenate([between, mine], axis=-1))  # [N L M H/2]
         contest = _pool_max(rivals, agent_there[:, None, :], axis=2)
@@ -80,7 +81,7 @@ class GraphTorso(eqx.Module):
         # Landmark → agent, and agent → agent.
         places = self.landmark(jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1))
         score = jnp.where(landmark_there, self.attention(places)[..., 0], -jnp.inf)
-        chosen = _pool_softmax(places, score)
+        chosen = attend(places, score)
         best = _pool_max(places, landmark_there, axis=1)
         others = self.agent(jnp.concatenate([_repeat(own, agents), _scales(agents)], axis=-1))
         crowd = _pool_max(others, agent_there, axis=1)
@@ -115,8 +116,7 @@ def _nearest(
 
 def _scales(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 5"]:
     """The offset, its length, and the offset near by magnified; finite gradients at 0."""
-    length = jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)
-    return jnp.concatenate([offsets, length, jnp.tanh(offsets / NEAR)], axis=-1)
+    return jnp.concatenate([with_length(offsets), jnp.tanh(offsets / NEAR)], axis=-1)
 
 
 def _repeat(own: Float[Array, "N K"], entities: Float[Array, "N M 2"]) -> Float[Array, "N M K"]:
@@ -126,9 +126,3 @@ def _repeat(own: Float[Array, "N K"], entities: Float[Array, "N M 2"]) -> Float[
 def _pool_max(values: Float[Array, "..."], there: Bool[Array, "..."], axis: int) -> Float[Array, "..."]:
     """The largest over an axis, of those that are there; they are ReLU outputs, so that nobody there is 0."""
     return jnp.max(jnp.where(there[..., None], values, 0.0), axis=axis, initial=0.0)
-
-
-def _pool_softmax(values: Float[Array, "N M H"], score: Float[Array, "N M"]) -> Float[Array, "N H"]:
-    """The mean weighted by the softmax of the score; 0 where every score is −∞."""
-    weight = jnp.exp(score - jax.lax.stop_gradient(jnp.max(score, axis=1, keepdims=True, initial=-1e9)))
-    return jnp.einsum("nm,nmh->nh", weight, values) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)
