@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from gacrl import config as configuration
 from gacrl import envs
-from gacrl.config import AlgorithmConfig, EnvConfig, GacrlPaperConfig, RunConfig
+from gacrl.config import AlgorithmConfig, EnvConfig, GacrlPaperConfig, QLearningConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
@@ -92,7 +92,9 @@ class _Acting(NamedTuple):
 
 def _without_experience(algorithm: AlgorithmConfig) -> AlgorithmConfig:
     """The same, with no room for a replay: playing needs none, and it is most of a learner."""
-    return replace(algorithm, replay_capacity=1) if hasattr(algorithm, "replay_capacity") else algorithm
+    if isinstance(algorithm, GacrlPaperConfig | QLearningConfig):
+        return replace(algorithm, replay_capacity=1)
+    return algorithm
 
 
 def pretrained() -> dict[str, Path]:

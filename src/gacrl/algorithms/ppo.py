@@ -23,7 +23,7 @@ from gacrl.algorithms.objectives import (
     no_returns,
 )
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns
-from gacrl.algorithms.shared import mean_real, share_reward, taken
+from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, taken
 from gacrl.config import PpoConfig, TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
@@ -143,9 +143,7 @@ def evaluate_critic(
 def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: View) -> Algorithm:
     """PPO for this task's shapes, with the critic's view."""
     actions = choices(env)
-    adam = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.flatten(optax.scale_by_adam(eps=1e-5))
-    )
+    adam = clipped_adam(config.max_grad_norm, eps=1e-5)
     settings = matched(env, config.network, actions.size)
     per_update = training.num_envs * training.num_steps
     hyper = Hyper(
@@ -187,7 +185,7 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         def act(
             memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
         ) -> tuple[Decision, Memory]:
-            actor_memory, critic_memory = memory or PpoMemory((), ())
+            actor_memory, critic_memory = split_memory(memory)
             talk_key, choice_key = jax.random.split(key)
             output, actor_memory = learner.network.actor(
                 observation, actor_memory, talk_key if explore else None, channel

@@ -21,7 +21,7 @@ from gacrl.algorithms.augmentation import turn_experience
 from gacrl.algorithms.exploration import Exploration, progress_between
 from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
 from gacrl.algorithms.returns import n_step_window
-from gacrl.algorithms.shared import share_reward
+from gacrl.algorithms.shared import clipped_adam, share_reward
 from gacrl.config import QLearningConfig, TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput, unroll
@@ -111,8 +111,7 @@ def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[
 def make(config: QLearningConfig, env: Environment, training: TrainingConfig, parts: Parts) -> Algorithm:
     """The learner for this task's shapes."""
     actions = choices(env)
-    clip = optax.clip_by_global_norm(config.max_grad_norm)
-    adam = optax.flatten(optax.chain(clip, optax.scale_by_adam()))
+    adam = clipped_adam(config.max_grad_norm)
     num_envs, num_steps = training.num_envs, training.num_steps
     learned, window = config.sequence_length, config.sequence_length + config.n_step - 1
     rows = max(-(-config.replay_capacity // (num_envs * num_steps)), -(-window // num_steps)) * num_steps

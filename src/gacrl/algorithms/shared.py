@@ -1,8 +1,14 @@
-"""Small functions on a team's arrays that more than one learner needs."""
+"""What more than one learner needs: functions on a team's arrays, and the optimiser."""
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float, Int
+
+
+def clipped_adam(max_grad_norm: float, eps: float = 1e-8) -> optax.GradientTransformation:
+    """Adam's directions (to be multiplied by the step size) of gradients shortened to a norm, on one flat vector."""
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.flatten(optax.scale_by_adam(eps=eps)))
 
 
 def taken(values: Float[Array, "*b A"], action: Int[Array, "*b"]) -> Float[Array, "*b"]:

@@ -30,19 +30,7 @@ ALGORITHMS: Mapping[str, str] = MappingProxyType(
 )
 """The paper's names, and the presets that train them."""
 
-_PPO: dict[str, Any] = {
-    "training": {"num_envs": 10, "num_steps": 25},
-    "algorithm": {
-        "num_minibatches": 4,
-        "update_epochs": 6,
-        "gamma": 0.9,
-        "gae_lambda": 0.8,
-        "clip_eps": 0.3,
-        "ent_coef": 0.001,
-        "learning_rate": 2e-3,
-        "network": {"width": 64},
-    },
-}
+_PPO: dict[str, Any] = {"training": {"num_envs": 10, "num_steps": 25}, "algorithm": {"learning_rate": 2e-3}}
 _AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
         "paper": {},
@@ -50,16 +38,7 @@ _AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
         "ippo": _PPO,
         "qmix": {
             "training": {"num_envs": 5, "num_steps": 15},
-            "algorithm": {
-                "updates": 10,
-                "batch_size": 128,
-                "reward_norm": True,
-                "max_grad_norm": 1.0,
-                "n_step": 3,
-                "learning_rate": 1e-3,
-                "epsilon_steps": 30_000,
-                "network": {"width": 64},
-            },
+            "algorithm": {"updates": 10, "epsilon_steps": 30_000, "network": {"width": 64}},
         },
     }
 )
