@@ -66,7 +66,12 @@ def numbers(config: Any, where: str = "") -> Iterator[tuple[str, str]]:
             yield where + field.name, "float" if "float" in str(field.type) else "int"
 
 
-NUMBERS = dict(numbers(UNUSUAL))
+NUMBERS = [
+    (base, path, kind)
+    for base in (UNUSUAL, preset("gacrl"), preset("qmix"), preset("mappo"))
+    for path, kind in numbers(base)
+    if base is UNUSUAL or path.startswith("algorithm.")
+]
 
 
 @pytest.mark.parametrize("config", [*(config for _, config in PRESETS.values()), UNUSUAL])
@@ -170,15 +175,15 @@ def test_a_value_of_the_wrong_type_is_refused(path: str, value: Any, wanted: str
     assert wanted in str(refused.value)
 
 
-@pytest.mark.parametrize("path", NUMBERS)
-def test_no_number_is_beyond_all_bounds(path: str):
+@pytest.mark.parametrize(("base", "path", "kind"), NUMBERS, ids=lambda it: it if isinstance(it, str) else "")
+def test_no_number_is_beyond_all_bounds(base: RunConfig, path: str, kind: str):
     """Also not NaN, which is neither below nor above any bound."""
     beyond: list[Any] = [-1, 10**30, 10**400]
-    if NUMBERS[path] == "float":
+    if kind == "float":
         beyond += [-0.001, math.nan, math.inf, -math.inf]
     for value in beyond:
         with pytest.raises(ConfigError) as refused:
-            from_dict(nested(path, value), UNUSUAL)
+            from_dict(nested(path, value), base)
         assert path in str(refused.value)
         assert "must" in str(refused.value)
 

@@ -24,7 +24,7 @@ class Train:
     Settings come from the preset, then --config, then the flags below.
 
     examples:
-      gacrl train                                     GACRL that solves the task, about two minutes
+      gacrl train                                     GACRL that solves the task
       gacrl train --preset paper --num-seeds 2        the paper's whole schedule, a seed on each core
       gacrl train --preset paper --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
       gacrl train --config my.json --seed 7           `gacrl config` prints such a file

@@ -212,9 +212,8 @@ class NetworkConfig:
     """Choose the width so that the acting network has about this many parameters; none: take the width."""
 
     def __post_init__(self) -> None:
-        _between(
-            "algorithm.network", self, 1, 65_536, "width", "vocabulary", "nearest_landmarks", "nearest_agents"
-        )
+        _between("algorithm.network", self, 1, 65_536, "width", "vocabulary", "latent_size")
+        _between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         _between("algorithm.network", self, 1, 100, "depth", "rounds")
         _between("algorithm.network", self, 0.0, 100.0, "dial_noise")
         _between("algorithm.network", self, 0.0, 1e6, "radius")
@@ -550,7 +549,7 @@ _GACRL = replace(_GACRL_112K, env=replace(_GACRL_112K.env, max_cycles=25), prese
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
-        "gacrl": ("GACRL that solves the task: 25 steps, in about two minutes", _GACRL),
+        "gacrl": ("GACRL that solves the task: episodes of 25 steps", _GACRL),
         "gacrl-112k": ("GACRL that solves the task, on the paper's budget of 112,500 steps", _GACRL_112K),
         "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
         "vdn": ("VDN: the same learner, values summed", _VDN),
