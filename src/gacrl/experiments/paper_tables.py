@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gacrl import envs
-from gacrl.config import EnvConfig, RunConfig
+from gacrl.config import RunConfig
 from gacrl.envs import scripted
-from gacrl.envs.spread import SpreadParams
-from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.evaluation.evaluate import stream_key
+from gacrl.training.session import scripted_program
 
 COLUMNS = {
     "reward_shaped": "Sh. Reward",
@@ -117,17 +117,8 @@ def reference_episodes(name: str, config: RunConfig, task: Mapping[str, float]) 
 
 
 def _play_scripted(name: str, config: RunConfig, local_ratio: float, threshold: float) -> dict[str, np.ndarray]:
-    play, params = _compiled(name, config.env)
-    params = params._replace(local_ratio=jnp.asarray(local_ratio), coverage_threshold=jnp.asarray(threshold))
-    return jax.device_get(play(params, stream_key("report")))
-
-
-@cache
-def _compiled(name: str, env_config: EnvConfig) -> tuple[Any, SpreadParams]:
-    """A scripted policy's evaluation, compiled once for every difficulty."""
-    env = envs.make(env_config)
-    actor = scripted.make(name, env)
-    play = jax.jit(
-        lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, REFERENCE_EPISODES)
+    env = envs.make(config.env)
+    params = env.default_params()._replace(
+        local_ratio=jnp.asarray(local_ratio), coverage_threshold=jnp.asarray(threshold)
     )
-    return play, env.default_params()
+    return jax.device_get(scripted_program(name, env, REFERENCE_EPISODES)(params, stream_key("report")))

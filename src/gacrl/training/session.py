@@ -208,7 +208,7 @@ def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, flo
     return {
         name: {
             metric: float(np.mean(values))
-            for metric, values in _scripted_program(name, env, num_episodes)(
+            for metric, values in scripted_program(name, env, num_episodes)(
                 env.default_params(), stream_key("report")
             ).items()
         }
@@ -217,7 +217,7 @@ def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, flo
 
 
 @cache
-def _scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[..., dict[str, jax.Array]]:
+def scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[..., dict[str, jax.Array]]:
     """A scripted policy's evaluation, traced once a process."""
     actor = scripted.make(name, env)
     return jax.jit(
