@@ -413,6 +413,16 @@ def test_success_by_hand():
     assert not result.terminated and result.info["coverage_0.1"] == 0.5
 
 
+def test_the_coverage_reward_by_hand():
+    """MPE2's reward and the bonus for the share that is covered; what is measured stays MPE2's."""
+    half = still([[0.05, 0.0], [0.7, 0.53]], [[0.0, 0.0], [0.5, 0.5]])
+    plain, paid = Spread(2, 2), Spread(2, 2, reward="coverage")
+    _, mpe2 = compiled(plain)(half, jnp.zeros(2, int), KEY)
+    _, found = compiled(paid)(half, jnp.zeros(2, int), KEY, numbers(paid, coverage_bonus=0.8))
+    np.testing.assert_allclose(found.reward, mpe2.reward + 0.8 * 0.5, rtol=1e-6)
+    jax.tree.map(np.testing.assert_array_equal, found.info, mpe2.info)
+
+
 @pytest.mark.parametrize(("num_agents", "num_landmarks"), [(3, 3), (1, 4), (4, 1)])
 def test_the_packed_state_is_all_of_it(num_agents, num_landmarks):
     env = Spread(num_agents, num_landmarks)

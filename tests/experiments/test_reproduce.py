@@ -506,6 +506,7 @@ def test_the_command_writes_a_report_that_has_every_claim(
         (["--episodes", "0"], "--episodes must be at least 1, not 0"),
         (["--out", "{tmp}/other"], "{tmp}/other exists and holds no reproduction: choose another --out"),
         (["--out", "{tmp}/mine"], "{tmp}/mine holds a reproduction with --seeds 3 and --episodes 9: ask for the same, or choose another --out"),
+        (["--out", "{tmp}/cut"], "{tmp}/cut/reproduce.json is damaged: choose another --out"),
         (["--seed", "3"], "unrecognized options: --seed, 3: did you mean --seeds?"),
     ],
 )  # fmt: skip
@@ -516,6 +517,8 @@ def test_mistakes_end_in_one_sentence(
     (tmp_path / "other" / "letter.txt").write_text("dear", encoding="utf-8")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "reproduce.json").write_text('{"seeds": 3, "episodes": 9}', encoding="utf-8")
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "reproduce.json").write_text('{"seeds": 3', encoding="utf-8")
     words = [word.format(tmp=tmp_path) for word in words]
     where = [] if "--out" in words else ["--out", str(tmp_path / "new")]
     assert main(["reproduce", *words, *where]) == 2

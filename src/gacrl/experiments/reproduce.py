@@ -13,10 +13,11 @@ from typing import Any, Literal
 
 from gacrl import config as configuration
 from gacrl.config import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig
-from gacrl.errors import UserError, reason
+from gacrl.errors import UserError
 from gacrl.experiments import evidence, reproduce_report
 from gacrl.experiments.claims import Judged
 from gacrl.experiments.comparisons import judge_all
+from gacrl.experiments.study import claim_folder
 from gacrl.training import session
 from gacrl.training.loop import Diverged
 from gacrl.training.recorder import RunFolder
@@ -144,7 +145,8 @@ def reproduce(
     if episodes < 1:
         raise UserError(f"--episodes must be at least 1, not {episodes}")
     runs = plan(out, seeds, episodes, extended)
-    _claim_folder(out, {"seeds": seeds, "episodes": episodes})
+    asked = {"seeds": seeds, "episodes": episodes}
+    claim_folder(out, "reproduce.json", asked, "reproduction", _asked_before)
     for planned in runs:
         _refuse_other_settings(planned)
     watch.planned([planned.name for planned in runs])
@@ -203,21 +205,7 @@ def _forget_half_made(folder: Path) -> None:
                 inner.unlink()
 
 
-def _claim_folder(out: Path, asked: dict[str, int]) -> None:
-    """Make the folder and say in it what it is for; refuse one that is for something else."""
-    marker = out / "reproduce.json"
-    if marker.is_file():
-        held = json.loads(marker.read_text(encoding="utf-8"))
-        if held != asked:
-            was = " and ".join(f"--{name} {value}" for name, value in held.items())
-            raise UserError(f"{out} holds a reproduction with {was}: ask for the same, or choose another --out")
-        return
-    unfinished = out / ".reproduce.json.unfinished"
-    if out.exists() and (not out.is_dir() or any(entry != unfinished for entry in out.iterdir())):
-        raise UserError(f"{out} exists and holds no reproduction: choose another --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(json.dumps(asked) + "\n", encoding="utf-8")
-        unfinished.replace(marker)
-    except OSError as error:
-        raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
+def _asked_before(held: Mapping[str, Any]) -> str:
+    """What to say of a folder that holds another reproduction."""
+    was = " and ".join(f"--{name} {value}" for name, value in held.items())
+    return f"a reproduction with {was}: ask for the same, or choose another --out"

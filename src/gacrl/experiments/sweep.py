@@ -17,9 +17,10 @@ from scipy import stats
 
 from gacrl import config as configuration
 from gacrl.config import RunConfig
-from gacrl.errors import UserError, reason
+from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import difference, estimate
+from gacrl.experiments.study import claim_folder
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.training import session
@@ -137,7 +138,8 @@ def sweep(
     together: members trained side by side; by default three for each CPU core, or all of them on an accelerator.
     Raises UserError for a folder that holds something else.
     """
-    _claim_folder(grid, out)
+    asked = {**asdict(grid), "choice": grid.choice._asdict(), "config": configuration.to_dict(grid.config)}
+    claim_folder(out, _MARKER, asked, "sweep", lambda held: "a sweep of other settings: choose another --out")
     members = [Member(point, seed) for point in grid.points for seed in grid.seeds]
     if together is None:
         together = 3 * jax.local_device_count() if jax.default_backend() == "cpu" else len(members)
@@ -220,24 +222,6 @@ def _hyper(trainer: Trainer, point: Point) -> Any:
         epsilon=hyper.epsilon._replace(start=point.epsilon),
         temperature=hyper.temperature._replace(start=point.temperature),
     )
-
-
-def _claim_folder(grid: Grid, out: Path) -> None:
-    """Make the folder and say in it what it is for; refuse one that is for something else."""
-    marker = out / _MARKER
-    asked = {**asdict(grid), "choice": grid.choice._asdict(), "config": configuration.to_dict(grid.config)}
-    text = json.dumps(asked, indent=2) + "\n"
-    if marker.is_file():
-        if marker.read_text(encoding="utf-8") != text:
-            raise UserError(f"{out} holds a sweep of other settings: choose another --out")
-        return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out} exists and holds no sweep: choose another --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        marker.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
 
 
 def _read(out: Path) -> Scores:
