@@ -15,7 +15,7 @@ import gacrl
 PACKAGE = Path(gacrl.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "config"),
+    ("errors", "types", "checks", "algorithm_config", "config"),
     ("arguments", "envs", "networks", "report"),
     ("algorithms",),
     ("rollout",),

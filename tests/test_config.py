@@ -12,13 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gacrl import config as configuration
+from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.config import (
     PRESETS,
-    ConfigError,
     CurriculumConfig,
     EnvConfig,
     EvaluationConfig,
-    GacrlPaperConfig,
     RunConfig,
     TrainingConfig,
     dumps,
@@ -28,6 +27,7 @@ from gacrl.config import (
     preset,
     to_dict,
 )
+from gacrl.errors import ConfigError
 
 PAPER = preset("paper")
 UNUSUAL = RunConfig(

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gacrl.api import make_env, train
-    from gacrl.config import ConfigError, RunConfig, preset
-    from gacrl.errors import UserError
+    from gacrl.config import RunConfig, preset
+    from gacrl.errors import ConfigError, UserError
     from gacrl.play import LoadedPolicy, load_policy
     from gacrl.training.session import Run
 
 _HOMES = {
-    "ConfigError": "gacrl.config",
+    "ConfigError": "gacrl.errors",
     "LoadedPolicy": "gacrl.play",
     "Run": "gacrl.training.session",
     "RunConfig": "gacrl.config",

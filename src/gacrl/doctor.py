@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gacrl import config, envs
-from gacrl.config import AlgorithmConfig, EnvConfig, GacrlPaperConfig, PpoConfig, QmixConfig
+from gacrl.algorithm_config import AlgorithmConfig, GacrlPaperConfig, PpoConfig, QmixConfig
+from gacrl.config import EnvConfig
 from gacrl.envs import scripted
 from gacrl.envs.probes import BEST_RETURN
 from gacrl.evaluation import mpe2

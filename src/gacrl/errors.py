@@ -8,3 +8,7 @@ class UserError(Exception):
 def reason(error: OSError) -> str:
     """The operating system's words for what went wrong, without numbers and tracebacks."""
     return error.strerror or str(error)
+
+
+class ConfigError(UserError, ValueError):
+    """A setting that cannot be: one sentence that names the thing and the mend."""

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from gacrl import config as configuration
 from gacrl import envs
-from gacrl.config import AlgorithmConfig, EnvConfig, GacrlPaperConfig, QLearningConfig, RunConfig
+from gacrl.algorithm_config import AlgorithmConfig, GacrlPaperConfig, QLearningConfig
+from gacrl.config import EnvConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from gacrl import config as configuration
+from gacrl.algorithm_config import NetworkConfig
 from gacrl.algorithms import algorithm as algorithms
 from gacrl.algorithms import gacrl
 from gacrl.algorithms.actions import STRENGTHS, choices
 from gacrl.algorithms.exploration import EXPLORING, GREEDY, UNSETTLED, Follower, adaptive
 from gacrl.algorithms.q_learning import Network
-from gacrl.config import NetworkConfig, TrainingConfig
+from gacrl.config import TrainingConfig
 from gacrl.envs.spread import Spread
 from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.layers import Linear, Mlp

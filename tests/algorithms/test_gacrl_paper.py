@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from gacrl import config as settings
+from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.algorithms import gacrl_paper, replay
 from gacrl.algorithms.exploration import Coverage
-from gacrl.config import CurriculumConfig, EnvConfig, GacrlPaperConfig
+from gacrl.config import CurriculumConfig, EnvConfig
 from gacrl.envs.spread import Spread
 from gacrl.networks.layers import num_parameters
 from gacrl.training import curriculum

@@ -12,10 +12,11 @@ from conftest import drawn, drawn_learner
 from scipy import special, stats
 
 from gacrl import rollout
+from gacrl.algorithm_config import IppoConfig, MappoConfig, NetworkConfig
 from gacrl.algorithms import ippo, mappo, ppo
 from gacrl.algorithms.objectives import clipped_surrogate, follow_returns, huber, no_returns
 from gacrl.algorithms.shared import mean_real, share_reward
-from gacrl.config import IppoConfig, MappoConfig, NetworkConfig, TrainingConfig
+from gacrl.config import TrainingConfig
 from gacrl.envs.probes import Probe
 from gacrl.envs.spread import Spread
 from gacrl.types import Decision, Rollout, Transition

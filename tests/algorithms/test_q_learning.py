@@ -12,10 +12,11 @@ from conftest import drawn_learner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gacrl.algorithm_config import QmixConfig
 from gacrl.algorithms import exploration, q_learning, replay
 from gacrl.algorithms.q_learning import Network, Parts, epsilon_greedy
 from gacrl.algorithms.qmix import MIXERS
-from gacrl.config import QmixConfig, TrainingConfig
+from gacrl.config import TrainingConfig
 from gacrl.envs.spread import Spread
 from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
 from gacrl.types import Decision, Observation, Rollout, Transition

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import drawn
 
-from gacrl.config import NetworkConfig
+from gacrl.algorithm_config import NetworkConfig
 from gacrl.envs.probes import Probe
 from gacrl.envs.spread import Spread
 from gacrl.networks import communication

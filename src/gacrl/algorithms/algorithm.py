@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from gacrl.config import (
+from gacrl.algorithm_config import (
     AlgorithmConfig,
     GacrlConfig,
     GacrlPaperConfig,
     IppoConfig,
     MappoConfig,
     QmixConfig,
-    TrainingConfig,
 )
+from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.types import Learner, Memory, Metrics, Policy, PRNGKey, Rollout
 

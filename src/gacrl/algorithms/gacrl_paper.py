@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.exploration import (
@@ -24,7 +25,7 @@ from gacrl.algorithms.exploration import (
     linear_decay,
     no_coverage,
 )
-from gacrl.config import GacrlPaperConfig, TrainingConfig
+from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
 from gacrl.networks.graph import neighbour_sum, observed_adjacency

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from gacrl.algorithm_config import PpoConfig
 from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import turn_experience
@@ -24,7 +25,7 @@ from gacrl.algorithms.objectives import (
 )
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, taken
-from gacrl.config import PpoConfig, TrainingConfig
+from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
 from gacrl.networks.critic import Critic, View

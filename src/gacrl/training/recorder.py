@@ -11,8 +11,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from gacrl import config as configuration
-from gacrl.config import ConfigError, RunConfig
-from gacrl.errors import UserError, reason
+from gacrl.config import RunConfig
+from gacrl.errors import ConfigError, UserError, reason
 
 
 class RunFolder:
