@@ -265,7 +265,7 @@ def like_settings(config: Any) -> st.SearchStrategy[dict[str, Any]]:
     return st.fixed_dictionaries({}, optional=optional)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(st.dictionaries(st.text(max_size=8), JSON, max_size=4) | like_settings(UNUSUAL))
 def test_any_object_is_settings_or_a_sentence(data: dict[str, Any]):
     try:

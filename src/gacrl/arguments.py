@@ -176,7 +176,7 @@ class Reproduce:
     same task. Stopped or killed, the same command goes on with what is missing.
 
     examples:
-      gacrl reproduce                                 5 seeds: about ten minutes on two cores
+      gacrl reproduce                                 5 seeds
       gacrl reproduce --seeds 2 --episodes 200 --out runs/look
     """
 
