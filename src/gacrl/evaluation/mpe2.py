@@ -50,7 +50,8 @@ def evaluate(
         actions = np.asarray(decision.action)
         rewards = [world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)]
         tally = count(going, tally, _stacked(worlds), np.array(rewards, np.float32))
-        going &= np.array([not world.over for world in worlds])
+        # A new array: JAX may still be reading the old one, which it need not have copied.
+        going = going & np.array([not world.over for world in worlds])
     metrics = jax.vmap(lambda tally: episode_metrics(tally, measures))(tally)
     return dict(zip(metric_names(measures), np.asarray(metrics).T, strict=True))
 
