@@ -256,8 +256,11 @@ class GacrlConfig(QLearningConfig):
     """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""
     latent_weight: float = 1e-3
     """Weight of the code's loss: reconstruction and KL divergence."""
-    exploration: Literal["adaptive", "linear", "fixed"] = "adaptive"
-    """The level of exploration follows the coverage that greedy episodes reach, or time, or stays at its end."""
+    exploration: Literal["adaptive", "linear", "fixed", "yoked"] = "adaptive"
+    """The level of exploration follows the coverage that greedy episodes reach, or time, or stays at its end, or
+    follows the coverage of another training."""
+    yoked_coverage: tuple[float, ...] = ()
+    """That coverage, at even spaces over the planned environment steps."""
     epsilon: float = 1.0
     """Share of random actions while nothing is covered."""
     epsilon_end: float = 0.05
@@ -281,6 +284,14 @@ class GacrlConfig(QLearningConfig):
         between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
         between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
         between("algorithm", self, 1, 1_000_000_000, "exploration_steps")
+        require(
+            all(0.0 <= coverage <= 1.0 for coverage in self.yoked_coverage),
+            "algorithm.yoked_coverage must be shares between 0 and 1",
+        )
+        require(
+            self.exploration != "yoked" or len(self.yoked_coverage) > 0,
+            "algorithm.exploration yoked needs the coverage to follow, in algorithm.yoked_coverage",
+        )
 
 
 AlgorithmConfig: TypeAlias = GacrlPaperConfig | GacrlConfig | MappoConfig | IppoConfig | QmixConfig

@@ -193,6 +193,34 @@ class Reproduce:
 
 
 @dataclass(frozen=True)
+class Ablate:
+    """Train GACRL with every part off in turn, and say what each part is worth, with intervals over seeds.
+
+    What a part's parameters were goes to the rest of the network, so that all have as many. Stopped or killed, the same
+    command goes on with what is missing.
+
+    examples:
+      gacrl ablate                                    every part, 5 seeds, 112,500 steps each
+      gacrl ablate --part no-messages --part no-graph --seeds 2 --env-steps 30000 --out runs/look
+    """
+
+    preset: str = "gacrl-112k"
+    """The preset that is taken apart, a GACRL one."""
+    part: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """What is taken away; may be given several times. None: everything."""
+    seeds: int = 5
+    """Seeds of each."""
+    seed: int = 0
+    """The first of them."""
+    env_steps: int | None = None
+    """Environment steps of each seed; none: the preset's."""
+    out: Path = Path("runs/ablation")
+    """The folder of the runs and the report."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Sweep:
     """Train a grid of settings in one program, and say how much of its spread chance alone makes.
 

@@ -17,6 +17,9 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
+    from gacrl.experiments.ablate import Ablation
+    from gacrl.experiments.reproduce import Reproduction
+    from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher, TerminalWatcher
     from gacrl.training.session import Run, Watcher
 
@@ -31,6 +34,7 @@ usage: gacrl COMMAND [OPTIONS]
   render     watch a run, random, noop or oracle: a GIF
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
+  ablate     every part of GACRL off in turn: what each is worth
   sweep      the paper's grid of settings, and the spread that chance alone makes
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
@@ -235,18 +239,43 @@ def _reproduce(words: list[str]) -> int:
 
     prepare_jax(max(asked.seeds, 1))
     from gacrl.experiments import reproduce
+
+    def study(watch: "Watch") -> "Reproduction | None":
+        return reproduce.reproduce(asked.out, asked.seeds, asked.episodes, asked.extended, watch)
+
+    return _studied(study, asked.out, asked.json)
+
+
+def _studied(study: Callable[["Watch"], "Ablation | Reproduction | None"], out: Path, as_json: bool) -> int:
+    """Make a study of many runs under the eyes of the terminal; Ctrl-C ends as in training."""
+    from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher
 
     with RunsWatcher() as terminal, _stopping(terminal):
-        watch = reproduce.Watch(terminal.planned, terminal.watcher, terminal.finished, terminal.say)
-        done = reproduce.reproduce(asked.out, asked.seeds, asked.episodes, asked.extended, watch)
+        done = study(Watch(terminal.planned, terminal.watcher, terminal.finished, terminal.say))
     if done is None:
-        print(f"stopped; the same command goes on with what is missing in {asked.out}")
+        print(f"stopped; the same command goes on with what is missing in {out}")
         return terminal.exit_code
     print(f"report     {done.report}")
-    if asked.json:
+    if as_json:
         print(json.dumps(done.to_dict()))
     return 0
+
+
+def _ablate(words: list[str]) -> int:
+    from gacrl import arguments
+
+    asked = arguments.parse(arguments.Ablate, words, "ablate")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(max(asked.seeds, 1))
+    from gacrl.experiments import ablate
+
+    def study(watch: "Watch") -> "Ablation | None":
+        config = replace(configuration.preset(asked.preset), seed=asked.seed)
+        return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, watch)
+
+    return _studied(study, asked.out, asked.json)
 
 
 def _sweep(words: list[str]) -> int:
@@ -317,6 +346,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "render": _render,
     "compare": _compare,
     "reproduce": _reproduce,
+    "ablate": _ablate,
     "sweep": _sweep,
     "presets": _presets,
     "config": _config,

@@ -389,7 +389,7 @@ def _coerce(value: Any, hint: Any, where: str) -> Any:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(str(value))  # infinity where it is too large
     if origin is tuple:
-        raise ConfigError(f"{where} must be a list of whole numbers, not {value!r}")
+        raise ConfigError(f"{where} must be a list, not {value!r}")
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
     matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
     require(matches, f"{where} must be {wanted}, not {value!r}")

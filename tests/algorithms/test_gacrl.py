@@ -121,6 +121,14 @@ def test_exploration_follows_what_greedy_episodes_cover():
     assert rule.follow(Follower(jnp.asarray(0.2)), unmeasured).coverage == jnp.float32(0.2)
 
 
+def test_a_yoked_level_replays_another_coverage():
+    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2", recorded=(0.0, 0.5, 1.0), planned_steps=300)
+    learned_well = Follower(jnp.asarray(0.9))
+    for steps, epsilon in ((0, 1.0), (99, 1.0), (100, 0.325), (299, 0.1), (900, 0.1)):
+        level = rule.level(learned_well, jnp.asarray(steps))
+        np.testing.assert_allclose(level.epsilon, epsilon, rtol=1e-6)
+
+
 def test_an_episode_is_settled_once():
     rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2")
     keys = jax.random.split(jax.random.key(0), 4_000)

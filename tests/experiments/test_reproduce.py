@@ -2,7 +2,6 @@
 
 import html
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,22 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TinyRun
 
 from gacrl import config as configuration
 from gacrl.cli import main
-from gacrl.config import RunConfig
 from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments import claims as claim_data
 from gacrl.experiments import comparisons, paper_tables, reproduce
 from gacrl.experiments.claims import Claim, Reading, claims, measures
 from gacrl.experiments.comparisons import judge, judge_all
-from gacrl.experiments.evidence import DIVERGED, Evidence, Reference, Series, blocks, read_series
-from gacrl.experiments.reproduce import Planned, Watch, at_paper_budget, plan, train_missing
-from gacrl.training import session
-from gacrl.training.loop import Diverged
+from gacrl.experiments.evidence import Evidence, Reference, Series, blocks
+from gacrl.experiments.reproduce import at_paper_budget, plan
+from gacrl.experiments.study import DIVERGED, Planned
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -305,17 +300,16 @@ def test_the_claims_are_sound_data():
 def test_every_run_has_the_papers_steps_and_logs_each_50_episodes(tmp_path: Path):
     runs = plan(tmp_path, seeds=5)
     assert len(runs) == 8
-    for run in runs:
+    for (column, _), run in runs.items():
         config = run.config
         assert config.num_updates * config.steps_per_update == 112_500
         assert config.updates_per_chunk * config.steps_per_update == 3_750
         assert (config.env.max_cycles, config.num_seeds) == (75, 5)
         paper = configuration.preset("paper")
-        assert (config.curriculum == paper.curriculum) == (config.env.reward == "paper") == (run.column == "paper")
-    assert {run.config.algorithm for run in runs if run.who == "GACRL"} == {
-        configuration.preset("paper").algorithm
-    }
-    assert {run.column for run in plan(tmp_path, 2, extended=True)} == {"paper", "mpe2", "extended"}
+        assert (config.curriculum == paper.curriculum) == (config.env.reward == "paper") == (column == "paper")
+    gacrl = {run.config.algorithm for (_, who), run in runs.items() if who == "GACRL"}
+    assert gacrl == {configuration.preset("paper").algorithm}
+    assert {column for column, _ in plan(tmp_path, 2, extended=True)} == {"paper", "mpe2", "extended"}
 
 
 def test_blocks_are_means_of_fifty_episodes_or_of_halves():
@@ -339,90 +333,6 @@ def test_the_last_fifty_episodes_are_pooled_from_as_many_stretches_as_hold_them(
     assert count == 75
     assert mean["m"] == pytest.approx([2.0])  # (45 · 0 + 30 · 5) / 75
     assert sd["m"] == pytest.approx([np.sqrt((45 * 1 + 30 * (4 + 25)) / 75 - 4)])
-
-
-def tiny(folder: Path, seed: int) -> Planned:
-    paper = configuration.preset("paper")
-    config = replace(
-        paper,
-        env=replace(paper.env, max_cycles=5),
-        algorithm=replace(paper.algorithm, replay_capacity=50, batch_size=4),
-        training=replace(paper.training, env_steps=30),
-        evaluation=replace(paper.evaluation, interval=10, num_episodes=2, final_episodes=2),
-        seed=seed,
-        num_seeds=2,
-    )
-    return Planned("paper", f"run {seed}", config, folder / str(seed))
-
-
-def watched(names: list[str], stop_after: int | None = None) -> Watch:
-    """Notes what is told; stops a run after so many evaluations."""
-
-    def watcher(name: str) -> Watcher:
-        seen: list[int] = []
-        return Watcher(
-            progress=lambda progress: seen.append(progress.env_steps),
-            finishing=lambda: names.append(f"{name}: {len(seen)}"),
-            stop=lambda: stop_after is not None and len(seen) >= stop_after,
-        )
-
-    return Watch(run=watcher, finished=lambda name, how: names.append(f"{name}: {how}"))
-
-
-def test_a_stopped_run_is_resumed_and_a_finished_one_left_alone(
-    tiny_run: TinyRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    nothing = {who: dict.fromkeys(EPISODE_METRICS, 0.0) for who in ("random", "noop", "oracle")}
-    monkeypatch.setattr(session, "evaluate_scripted", lambda *task: nothing)  # long to compile, and not at stake
-    folders = [Path(shutil.copytree(tiny_run.folder, tmp_path / name)) for name in ("finished", "stopped")]
-    runs = [Planned("paper", path.name, RunFolder.open(path).config(), path) for path in folders]
-    (folders[1] / "summary.json").unlink()
-    shutil.rmtree(max((folders[1] / "checkpoints").glob("step-*")))
-    said: list[str] = []
-    assert train_missing(runs, watched(said))
-    first, second = (run.name for run in runs)
-    assert said == [f"{first}: there already", f"{second}: 1", f"{second}: done"], "one evaluation was left"
-    resumed, whole = (read_series(path) for path in reversed(folders))
-    np.testing.assert_array_equal(resumed.episodes, whole.episodes)
-    np.testing.assert_allclose(resumed.mean["reward_shaped"], whole.mean["reward_shaped"], rtol=1e-5)
-    assert whole.mean["reward_shaped"].shape == (2, len(whole.episodes))
-
-
-def test_only_what_is_missing_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    runs = [tiny(tmp_path, seed) for seed in range(3)]
-    started: list[Path] = []
-
-    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Run:
-        started.append(out)
-        folder = RunFolder.create(out, config)
-        if watcher.stop():
-            return session.Run(out, config, 10, None)
-        folder.write_summary({})
-        return session.Run(out, config, 30, {})
-
-    monkeypatch.setattr(session, "start", start)
-    assert not train_missing([tiny(tmp_path, 9), *runs], watched([], stop_after=0)), "stopped: nothing else begins"
-    assert [out.name for out in started] == ["9"]
-    started.clear()
-    (runs[0].folder / "checkpoints").mkdir(parents=True)  # as a run that was killed at once leaves it
-    assert train_missing(runs, watched([]))
-    shutil.rmtree(runs[1].folder)
-    assert train_missing(runs, watched([]))
-    assert started == [*(run.folder for run in runs), runs[1].folder]
-
-
-def test_a_run_that_diverged_is_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def diverge(config: RunConfig, out: Path, watcher: Watcher) -> None:
-        RunFolder.create(out, config)
-        raise Diverged("seed 0 diverged: loss is nan by environment step 9; try less")
-
-    monkeypatch.setattr(session, "start", diverge)
-    run, said = tiny(tmp_path, 0), list[str]()
-    assert train_missing([run], watched(said))
-    assert train_missing([run], watched(said))
-    assert said == [f"{run.name}: diverged", f"{run.name}: there already"]
-    because = json.loads((run.folder / DIVERGED).read_text(encoding="utf-8"))["because"]
-    assert because == "seed 0 diverged: loss is nan by environment step 9"
 
 
 # The whole command, on runs that are there already
@@ -468,12 +378,12 @@ def test_the_command_writes_a_report_that_has_every_claim(
     out = tmp_path / "out"
     out.mkdir()
     (out / "reproduce.json").write_text('{"seeds": 2, "episodes": 1500}', encoding="utf-8")
-    for run in plan(out, seeds=2, extended=True):
-        if (run.column, run.who) == ("mpe2", "GACRL"):
+    for (column, who), run in plan(out, seeds=2, extended=True).items():
+        if (column, who) == ("mpe2", "GACRL"):
             RunFolder.create(run.folder, run.config)
             (run.folder / DIVERGED).write_text('{"because": "loss is nan"}', encoding="utf-8")
         else:
-            pretend(run, 5.0 if run.who == "MAPPO" else 0.0)
+            pretend(run, 5.0 if who == "MAPPO" else 0.0)
     assert main(["reproduce", "--seeds", "2", "--extended", "--out", str(out), "--json"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert "GACRL, the paper's reward: there already" in said
@@ -529,7 +439,7 @@ def test_a_run_with_other_settings_is_not_mixed_in(tmp_path: Path, capsys: pytes
     out = tmp_path / "out"
     out.mkdir()
     (out / "reproduce.json").write_text('{"seeds": 2, "episodes": 1500}', encoding="utf-8")
-    run = plan(out, seeds=2)[3]
+    run = list(plan(out, seeds=2).values())[3]
     RunFolder.create(run.folder, replace(run.config, seed=4))
     assert main(["reproduce", "--seeds", "2", "--out", str(out)]) == 2
     assert f"{run.folder} was trained with other settings than this version plans" in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """How much agents explore: linearly less, or by coverage, as equations (13) to (16) of the paper."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -139,6 +139,8 @@ def adaptive(
     temperature: tuple[float, float],
     greedy_share: float,
     measure: str,
+    recorded: Sequence[float] = (),
+    planned_steps: int = 1,
     memory: float = 0.05,
 ) -> Exploration:
     """ε and τ follow coverage c: end + (start − end) (1 − c)², with c from episodes that do not explore.
@@ -149,10 +151,16 @@ def adaptive(
 
     measure: the name of the coverage among the task's measurements; a task that does not measure it is explored
     as if nothing were covered.
+    recorded: c of another training, at even spaces over `planned_steps`, to be followed in place of this one's: the
+    same levels without the feedback (yoked). The share of greedy episodes stays, so that nothing else differs.
     """
 
     def level(state: Follower, env_steps: Int[Array, ""]) -> Level:
-        missing = jnp.square(1.0 - state.coverage)
+        coverage = state.coverage
+        if recorded:
+            stretch = env_steps * len(recorded) // planned_steps
+            coverage = jnp.asarray(recorded)[jnp.clip(stretch, 0, len(recorded) - 1)]
+        missing = jnp.square(1.0 - coverage)
         return Level(*(end + (start - end) * missing for start, end in (epsilon, temperature)))
 
     def follow(state: Follower, steps: Transition) -> Follower:

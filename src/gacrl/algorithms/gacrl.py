@@ -66,18 +66,19 @@ def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Alg
     parts = Parts(
         networks=networks,
         team_value=partial(central, actions) if config.critic == "central" else summed,
-        exploration=_exploration(config),
+        exploration=_exploration(config, training.env_steps),
         auxiliary=auxiliary,
         averaged=config.averaged,
     )
     return q_learning.make(config, env, training, parts)
 
 
-def _exploration(config: GacrlConfig) -> Exploration:
+def _exploration(config: GacrlConfig, planned_steps: int) -> Exploration:
     epsilon, temperature = (config.epsilon, config.epsilon_end), (config.temperature, config.temperature_end)
-    if config.exploration == "adaptive":
+    if config.exploration in ("adaptive", "yoked"):
+        recorded = config.yoked_coverage if config.exploration == "yoked" else ()
         measure = f"coverage_{config.coverage_radius}"
-        return exploration.adaptive(epsilon, temperature, config.greedy_share, measure)
+        return exploration.adaptive(epsilon, temperature, config.greedy_share, measure, recorded, planned_steps)
     if config.exploration == "fixed":
         epsilon = (config.epsilon_end, config.epsilon_end)
         temperature = (config.temperature_end, config.temperature_end)

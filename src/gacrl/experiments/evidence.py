@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from gacrl.config import RunConfig
 from gacrl.envs.scripted import SCRIPTED
 from gacrl.experiments.paper_tables import reference_episodes
+from gacrl.experiments.study import why_diverged
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]
@@ -28,10 +29,6 @@ COLUMNS: Mapping[str, str] = MappingProxyType(
 """What the algorithms are trained on: the paper's reward and curriculum, MPE2's reward, or a task of their own."""
 FINAL_EPISODES = 50
 """What the paper's final metrics cover, and what a random policy is averaged over beside them."""
-
-
-DIVERGED = "diverged.json"
-"""In the folder of a run that ended so: {because}."""
 
 
 class MissingRun(LookupError):
@@ -168,11 +165,8 @@ def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def gather(folders: Mapping[tuple[str, str], Path]) -> Evidence:
     """The evidence of run folders that are finished or diverged, and of scripted policies in the same tasks."""
-    diverged = {
-        key: json.loads((path / DIVERGED).read_text(encoding="utf-8"))["because"]
-        for key, path in folders.items()
-        if (path / DIVERGED).is_file()
-    }
+    reasons = {key: why_diverged(path) for key, path in folders.items()}
+    diverged = {key: because for key, because in reasons.items() if because is not None}
     series = {key: read_series(path) for key, path in folders.items() if key not in diverged}
     references: dict[tuple[str, str], Reference] = {}
     for column in ("paper", "mpe2"):

@@ -4,8 +4,7 @@ Every pair of column and algorithm is a run folder of its own, so that a stopped
 is missing. What the runs showed is judged in `comparisons` and written down in `reproduce_report`.
 """
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -17,11 +16,7 @@ from gacrl.errors import UserError
 from gacrl.experiments import evidence, reproduce_report
 from gacrl.experiments.claims import Judged
 from gacrl.experiments.comparisons import judge_all
-from gacrl.experiments.study import claim_folder
-from gacrl.training import session
-from gacrl.training.loop import Diverged
-from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Run, Watcher
+from gacrl.experiments.study import Planned, Watch, claim_folder, refuse_other_settings, train_missing
 
 Column = Literal["paper", "mpe2", "extended"]
 
@@ -44,36 +39,6 @@ _AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
     }
 )
 """What differs from a preset that has millions of steps, where it gets the paper's 112,500."""
-
-
-@dataclass(frozen=True)
-class Planned:
-    """One run of the experiment: an algorithm in a column, all seeds."""
-
-    column: Column
-    who: str
-    config: RunConfig
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        return f"{self.who}, {evidence.COLUMNS[self.column]}"
-
-    @property
-    def finished(self) -> bool:
-        """Nothing is left to do: it was trained to its end, or diverged."""
-        return any((self.folder / name).is_file() for name in ("summary.json", evidence.DIVERGED))
-
-
-@dataclass(frozen=True)
-class Watch:
-    """What a reproduction tells whoever looks on: all of it optional."""
-
-    planned: Callable[[list[str]], None] = lambda names: None
-    run: Callable[[str], Watcher] = lambda name: Watcher()
-    finished: Callable[[str, str], None] = lambda name, how: None
-    """(name, how it ended)."""
-    say: Callable[[str], None] = lambda sentence: None
 
 
 @dataclass(frozen=True)
@@ -112,23 +77,25 @@ def in_column(config: RunConfig, column: Column) -> RunConfig:
     return replace(config, env=replace(config.env, reward=paper.env.reward), curriculum=paper.curriculum)
 
 
-def plan(out: Path, seeds: int, episodes: int = EPISODES, extended: bool = False) -> list[Planned]:
-    """The runs of the experiment, in the order in which they are made."""
-    runs: list[Planned] = []
+def plan(
+    out: Path, seeds: int, episodes: int = EPISODES, extended: bool = False
+) -> dict[tuple[Column, str], Planned]:
+    """The runs of the experiment by column and algorithm, in the order in which they are made."""
+    configs: dict[tuple[Column, str], RunConfig] = {}
     columns: tuple[Column, ...] = ("paper", "mpe2")
     for column in columns:
         for who, preset in ALGORITHMS.items():
             config = in_column(at_paper_budget(preset), column)
-            config = replace(
-                config, num_seeds=seeds, training=replace(config.training, env_steps=episodes * HORIZON)
-            )
-            runs.append(Planned(column, who, config, out / f"{column}-{who.lower()}"))
+            training = replace(config.training, env_steps=episodes * HORIZON)
+            configs[column, who] = replace(config, num_seeds=seeds, training=training)
     if extended:
         for who in ("gacrl", "qmix", "mappo", "ippo"):
             if who in configuration.PRESETS:
-                config = replace(configuration.preset(who), num_seeds=seeds)
-                runs.append(Planned("extended", who, config, out / f"extended-{who}"))
-    return runs
+                configs["extended", who] = replace(configuration.preset(who), num_seeds=seeds)
+    return {
+        (column, who): Planned(f"{who}, {evidence.COLUMNS[column]}", config, out / f"{column}-{who.lower()}")
+        for (column, who), config in configs.items()
+    }
 
 
 def reproduce(
@@ -144,65 +111,22 @@ def reproduce(
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if episodes < 1:
         raise UserError(f"--episodes must be at least 1, not {episodes}")
-    runs = plan(out, seeds, episodes, extended)
+    planned = plan(out, seeds, episodes, extended)
+    runs = list(planned.values())
     asked = {"seeds": seeds, "episodes": episodes}
     claim_folder(out, "reproduce.json", asked, "reproduction", _asked_before)
-    for planned in runs:
-        _refuse_other_settings(planned)
-    watch.planned([planned.name for planned in runs])
+    refuse_other_settings(runs)
+    watch.planned([run.name for run in runs])
     if not train_missing(runs, watch):
         return None
     watch.say("playing random, noop and oracle at the difficulty of every stretch")
-    found = evidence.gather({(run.column, run.who): run.folder for run in runs})
+    found = evidence.gather({place: run.folder for place, run in planned.items()})
     if ("paper", "GACRL") in found.diverged:
         raise UserError(f"there is nothing to compare with: GACRL's {found.diverged['paper', 'GACRL']}")
     judged = judge_all(found)
     watch.say("writing the report")
     report = reproduce_report.write(out, found, judged, seeds, episodes)
     return Reproduction(out, report, judged)
-
-
-def train_missing(runs: list[Planned], watch: Watch) -> bool:
-    """Train what is not finished, each from where it stopped; False where the watcher stopped it."""
-    for planned in runs:
-        if planned.finished:
-            watch.finished(planned.name, "there already")
-            continue
-        try:
-            if _train(planned, watch.run(planned.name)).summary is None:
-                return False
-            watch.finished(planned.name, "done")
-        except Diverged as error:
-            text = json.dumps({"because": str(error).partition(";")[0]}) + "\n"
-            (planned.folder / evidence.DIVERGED).write_text(text, encoding="utf-8")
-            watch.finished(planned.name, "diverged")
-    return True
-
-
-def _train(planned: Planned, watcher: Watcher) -> Run:
-    if (planned.folder / "config.json").is_file():
-        return session.resume(planned.folder, watcher=watcher)
-    _forget_half_made(planned.folder)
-    return session.start(planned.config, planned.folder, watcher)
-
-
-def _refuse_other_settings(planned: Planned) -> None:
-    """Raises UserError where the run's folder holds a run with other settings than planned."""
-    if (planned.folder / "config.json").is_file() and RunFolder.open(planned.folder).config() != planned.config:
-        raise UserError(
-            f"{planned.folder} was trained with other settings than this version plans: choose another --out, "
-            "or remove that folder to train it again"
-        )
-
-
-def _forget_half_made(folder: Path) -> None:
-    """Remove the empty folders of a run that was killed before it had settings."""
-    if folder.is_dir():
-        for inner in folder.iterdir():
-            if inner.is_dir() and not any(inner.iterdir()):
-                inner.rmdir()
-            elif inner.name.startswith(".config.json"):
-                inner.unlink()
 
 
 def _asked_before(held: Mapping[str, Any]) -> str:

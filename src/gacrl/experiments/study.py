@@ -1,11 +1,79 @@
-"""The folder of a study of many runs: it says what it is for, so that a stopped study goes on and no other starts."""
+"""A folder of planned runs: it says what it is for, and a stopped study goes on with the runs that are missing."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
+from gacrl.training import session
+from gacrl.training.loop import Diverged
+from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Run, Watcher
+
+DIVERGED = "diverged.json"
+"""In the folder of a run that ended so: {because}."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One run of a study, all seeds."""
+
+    name: str
+    config: RunConfig
+    folder: Path
+
+    @property
+    def finished(self) -> bool:
+        """Nothing is left to do: it was trained to its end, or diverged."""
+        return any((self.folder / name).is_file() for name in ("summary.json", DIVERGED))
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a study tells whoever looks on: all of it optional."""
+
+    planned: Callable[[list[str]], None] = lambda names: None
+    run: Callable[[str], Watcher] = lambda name: Watcher()
+    finished: Callable[[str, str], None] = lambda name, how: None
+    """(name, how it ended)."""
+    say: Callable[[str], None] = lambda sentence: None
+
+
+def why_diverged(folder: Path) -> str | None:
+    """Why the run in that folder diverged; None for one that did not."""
+    path = folder / DIVERGED
+    return json.loads(path.read_text(encoding="utf-8"))["because"] if path.is_file() else None
+
+
+def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
+    """Train what is not finished, each from where it stopped; False where the watcher stopped it."""
+    for planned in runs:
+        if planned.finished:
+            watch.finished(planned.name, "there already")
+            continue
+        try:
+            if _train(planned, watch.run(planned.name)).summary is None:
+                return False
+            watch.finished(planned.name, "done")
+        except Diverged as error:
+            text = json.dumps({"because": str(error).partition(";")[0]}) + "\n"
+            (planned.folder / DIVERGED).write_text(text, encoding="utf-8")
+            watch.finished(planned.name, "diverged")
+    return True
+
+
+def refuse_other_settings(runs: Sequence[Planned]) -> None:
+    """Raises UserError where a run's folder holds a run with other settings than planned."""
+    for planned in runs:
+        folder = planned.folder
+        if (folder / "config.json").is_file() and RunFolder.open(folder).config() != planned.config:
+            raise UserError(
+                f"{folder} was trained with other settings than this version plans: choose another --out, "
+                "or remove that folder to train it again"
+            )
 
 
 def claim_folder(
@@ -35,3 +103,20 @@ def claim_folder(
         unfinished.replace(path)
     except OSError as error:
         raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
+
+
+def _train(planned: Planned, watcher: Watcher) -> Run:
+    if (planned.folder / "config.json").is_file():
+        return session.resume(planned.folder, watcher=watcher)
+    _forget_half_made(planned.folder)
+    return session.start(planned.config, planned.folder, watcher)
+
+
+def _forget_half_made(folder: Path) -> None:
+    """Remove the empty folders of a run that was killed before it had settings."""
+    if folder.is_dir():
+        for inner in folder.iterdir():
+            if inner.is_dir() and not any(inner.iterdir()):
+                inner.rmdir()
+            elif inner.name.startswith(".config.json"):
+                inner.unlink()

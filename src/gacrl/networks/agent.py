@@ -134,6 +134,11 @@ def unroll(
     return jax.lax.scan(step, memory, (observations, first, keys))[1]
 
 
+def acting_parameters(env: Environment, config: NetworkConfig, num_outputs: int) -> int:
+    """How many parameters the network of these settings has."""
+    return num_parameters(eqx.filter_eval_shape(AgentNetwork, env, config, num_outputs, jax.random.key(0)))
+
+
 def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> NetworkConfig:
     """The configuration with the width at which the network's parameters come nearest to those asked for."""
     wanted = config.parameters
@@ -141,8 +146,7 @@ def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> Networ
         return config
 
     def size(width: int) -> int:
-        at = replace(config, width=width, parameters=None)
-        return num_parameters(eqx.filter_eval_shape(AgentNetwork, env, at, num_outputs, jax.random.key(0)))
+        return acting_parameters(env, replace(config, width=width, parameters=None), num_outputs)
 
     low, high = 2, 4
     while size(high) < wanted and high < 65_536:

@@ -1,0 +1,153 @@
+"""`gacrl ablate`: what is taken away and nothing else, levels replayed, a table and figures, resumption."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gacrl import config as configuration
+from gacrl.algorithm_config import GacrlConfig
+from gacrl.cli import main
+from gacrl.config import RunConfig
+from gacrl.experiments import ablate
+from gacrl.experiments.ablate import FULL, METRICS, PARTS, SCORE, YOKED, plan
+from gacrl.experiments.study import DIVERGED, Planned
+from gacrl.training import session
+from gacrl.training.loop import Diverged
+from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Watcher
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+STEPS = (100, 200, 300, 400)
+EPSILON = np.array([[1.0, 0.51, 0.265, 0.02], [1.0, 0.51, 0.265, 0.02]])
+"""With ε from 1 to 0.02: coverages 0, 1 − √½, ½, 1."""
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Planned]:
+    config = configuration.preset("gacrl-112k")
+    return {run.name: run for run in plan(config, tmp_path_factory.mktemp("plan"), list(PARTS))}
+
+
+def test_each_run_differs_from_the_whole_in_its_part_alone(planned: dict[str, Planned]):
+    assert list(planned) == [FULL, *PARTS]
+    whole = planned[FULL].config
+    for name, part in PARTS.items():
+        config = planned[name].config
+        assert config != whole
+        back = configuration.from_dict(configuration.to_dict(whole), config)
+        assert back == whole
+        changed = {
+            key
+            for key, value in configuration.to_dict(config)["algorithm"].items()
+            if value != configuration.to_dict(whole)["algorithm"][key]
+        }
+        assert changed <= {*part.changes.get("algorithm", {}), "yoked_coverage"}
+        assert (config.env != whole.env) == ("env" in part.changes)
+        assert config.training == whole.training
+
+
+def test_networks_without_a_part_are_about_as_large(planned: dict[str, Planned]):
+    sizes = {name: ablate._num_parameters(run.config) for name, run in planned.items()}
+    whole = sizes[FULL]
+    assert all(abs(size - whole) < 0.05 * whole for size in sizes.values()), sizes
+    narrow = replace(planned["no-messages"].config.algorithm.network, parameters=None)  # pyright: ignore
+    without = replace(planned["no-messages"].config.algorithm, network=narrow)
+    shrunk = ablate._num_parameters(replace(planned["no-messages"].config, algorithm=without))
+    assert shrunk < 0.95 * whole, "what was evened out"
+
+
+def finish(config: RunConfig, out: Path, score: float) -> session.Run:
+    """A finished run of made-up numbers: seeds a little around the score."""
+    folder = RunFolder.create(out, config)
+    folder.append_metrics(
+        [
+            {
+                "seed": seed,
+                "env_steps": step,
+                "greedy": {SCORE: score * (place + 1) / len(STEPS)},
+                "update": {"epsilon": float(EPSILON[0, place])},
+            }
+            for place, step in enumerate(STEPS)
+            for seed in config.seeds
+        ]
+    )
+    values = {"values": [score + 0.001 * k for k in range(config.num_seeds)]}
+    summary = {"final": {"greedy": dict.fromkeys(METRICS, values)}}
+    folder.write_summary(summary)
+    return session.Run(out, config, STEPS[-1], summary)
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
+    """Runs end at once: worse without messages, better without symmetry, and diverging without the bonus."""
+    started: list[RunConfig] = []
+
+    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Run:
+        started.append(config)
+        if config.env.reward == "mpe2":
+            RunFolder.create(out, config)
+            raise Diverged("seed 0 diverged: loss is nan; try less")
+        assert isinstance(config.algorithm, GacrlConfig)
+        quiet = config.algorithm.network.communication == "none"
+        return finish(config, out, 0.7 if quiet else 0.9 if config.algorithm.augment else 0.95)
+
+    monkeypatch.setattr(session, "start", start)
+    return started
+
+
+def test_the_command_says_what_each_part_is_worth(
+    trained: list[RunConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    parts = ("no-messages", "no-symmetry", "no-coverage-bonus", YOKED)
+    words = ["ablate", *(word for part in parts for word in ("--part", part)), "--seeds", "3", "--out", str(out)]
+    assert main([*words, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
+    runs = {run["name"]: run for run in answer["runs"]}
+    assert list(runs) == [FULL, *parts]
+    assert runs[FULL]["probability_that_the_part_helps"] is None
+    assert runs["no-messages"]["probability_that_the_part_helps"] == [1.0, 1.0, 1.0]
+    assert runs["no-symmetry"]["probability_that_the_part_helps"][0] == 0.0
+    assert runs["no-coverage-bonus"]["diverged"] == "seed 0 diverged: loss is nan"
+    assert (out / "no-coverage-bonus" / DIVERGED).is_file()
+    assert runs["no-messages"]["intervals"][SCORE][0] == pytest.approx(0.701)
+
+    algorithm = trained[-1].algorithm
+    assert isinstance(algorithm, GacrlConfig)
+    assert algorithm.exploration == "yoked"
+    np.testing.assert_allclose(algorithm.yoked_coverage, [0, 1 - np.sqrt(0.5), 0.5, 1], atol=1e-4)
+
+    page = Path(answer["report"]).read_text(encoding="utf-8")
+    assert "diverged: seed 0 diverged" in page
+    assert "0.701 [0.700, 0.702]" in page
+    assert page.count("<figure>") == 4
+    assert "gacrl ablate --preset gacrl-112k --seeds 3 --seed 0 --env-steps 112500 --part no-messages" in page
+
+    before = len(trained)
+    assert main(words) == 0
+    assert len(trained) == before, "nothing is trained twice"
+    assert main(["ablate", "--seeds", "4", "--out", str(out)]) == 2
+    assert "holds another ablation" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--seeds", "1"], "--seeds must be at least 2, not 1: with one there is no interval over seeds"),
+        (["--preset", "qmix"], "--preset qmix has no parts to take away: name a GACRL preset"),
+        (["--part", "no-message"], "unknown part 'no-message': did you mean 'no-messages'?"),
+        (["--env-steps", "0"], "training.env_steps must be between 1 and"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    assert main(["ablate", *words, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
