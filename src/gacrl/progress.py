@@ -292,6 +292,12 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
     for who, metrics in scores["references"].items():
         table.add_row(who, *[_cell(metrics.get(name), None, 3) for name in _SHOWN])
     console.print(table)
+    if "messages" in scores:
+        bits = scores["messages"]
+        console.print(
+            f"messages   {bits['bits_sent']:.2f} bits an agent and step; "
+            f"{bits['bits_used_last_round']:.2f} in the last round's symbol, by how often each is sent"
+        )
 
 
 def _cell(mean: float | None, sd: float | None = None, digits: int = 2) -> str:

@@ -14,12 +14,16 @@ from gacrl.envs.spread import Spread
 from gacrl.evaluation import episodes as recording
 from gacrl.evaluation import mpe2
 from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation.messages import bits_used
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.play import TrainedRun, open_run
 from gacrl.training.session import evaluate_scripted
 from gacrl.types import Memory, Policy
 
 Warn = Callable[[str], None]
+
+_HEARD = 32
+"""Episodes in which the symbols are counted."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,12 @@ def score_run(
 ) -> dict[str, Any]:
     """The metrics of a policy, greedy and sampled, with those of the scripted policies on the same starts.
 
-    Returns {run, backend, episodes, horizon, num_agents, final: {greedy, sampled}, references}, as in
-    `summary.json`. MPE2 draws its own starts: there, the scripted policies play those.
+    Returns {run, backend, episodes, horizon, num_agents, final: {greedy, sampled}, references} as in
+    `summary.json`, and messages where agents send symbols. MPE2 draws its own starts: there, the scripted policies
+    play those.
     """
     changes = changes or Changes()
+    messages = None
     if run in scripted.SCRIPTED:
         env = envs.make(changes.apply(EnvConfig()))
         references = _references(env, episodes, backend)
@@ -61,6 +67,7 @@ def score_run(
             kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
             for kind in ("greedy", "sampled")
         }
+        messages = _messages(opened)
     return {
         "run": run,
         "backend": backend,
@@ -69,7 +76,21 @@ def score_run(
         "num_agents": env.num_agents,
         "final": {kind: normalised(metrics, references) for kind, metrics in final.items()},
         "references": references,
+        **({} if messages is None else {"messages": messages}),
     }
+
+
+def _messages(opened: TrainedRun) -> dict[str, float] | None:
+    """Bits that an agent of the first member sends in a step of greedy play, and how many a good code would need."""
+    network = getattr(opened.config.algorithm, "network", None)
+    if network is None or network.communication != "discrete":
+        return None
+    env, policy = opened.env, opened.policy(0, False)
+    key = stream_key("report")
+    heard = recording.record_many(env, policy, opened.trainer.memory, env.default_params(), key, _HEARD)
+    sent = network.rounds * float(np.log2(network.vocabulary))
+    used = bits_used(heard)
+    return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
 
 
 def record_run(

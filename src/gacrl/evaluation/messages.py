@@ -1,0 +1,30 @@
+"""How much is said: the bits of the symbols that agents send."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gacrl.evaluation.episodes import Episode
+
+
+def bits_used(episodes: Sequence[Episode]) -> float | None:
+    """Entropy of the symbol of an agent's last round, over all agents, steps and episodes, in bits.
+
+    What a code made for these frequencies would need for each; at most log2 of the vocabulary. None where nothing
+    is said, or messages are no symbols.
+    """
+    counts = None
+    for episode in episodes:
+        if episode.messages is None or not _symbols(episode.messages):
+            return None
+        spoken = episode.messages[:, episode.agent_mask].reshape(-1, episode.messages.shape[-1]).sum(0)
+        counts = spoken if counts is None else counts + spoken
+    if counts is None or counts.sum() == 0:
+        return None
+    share = counts[counts > 0] / counts.sum()
+    return float(-(share * np.log2(share)).sum()) + 0.0  # no −0
+
+
+def _symbols(messages: np.ndarray) -> bool:
+    """Every message is a one-hot, or nothing."""
+    return bool(np.isin(messages, (0.0, 1.0)).all() and (messages.sum(-1) <= 1).all())
