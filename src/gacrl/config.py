@@ -60,7 +60,7 @@ class EnvConfig:
     reward: Literal["mpe2", "paper", "coverage"] = "mpe2"
     """What the learner earns: MPE2's reward, the paper's shaped one (equation 1), or MPE2's and a bonus for every
     step in which a landmark is covered within 0.1. Metrics are always of MPE2's."""
-    coverage_bonus: float = 0.5
+    coverage_bonus: float = 1.0
     """Of reward coverage: what a step with every landmark covered adds."""
     collision_term: Literal["per_agent", "once"] = "per_agent"
     """Equation (1)'s collision term inside the sum over agents, or once."""
@@ -240,27 +240,48 @@ _DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, wid
 
 _GACRL_112K = RunConfig(
     algorithm=GacrlConfig(
-        network=NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete"),
+        network=NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete", rounds=2),
         learning_rate=1e-3,
         learning_rate_end=1e-4,
         n_step=3,
         augment=True,
+        double_q=False,
         epsilon_end=0.02,
-        replay_capacity=120_000,
+        replay_capacity=150_000,
         learning_starts=500,
+        batch_size=64,
         updates=10,
     ),
     env=EnvConfig(max_cycles=75, reward="coverage"),
-    training=TrainingConfig(env_steps=112_500, num_envs=5, num_steps=5),
+    training=TrainingConfig(env_steps=112_500, num_envs=25, num_steps=1),
     evaluation=EvaluationConfig(interval=7_500),
     preset="gacrl-112k",
 )
-_GACRL = replace(_GACRL_112K, env=replace(_GACRL_112K.env, max_cycles=25), preset="gacrl")
+_GACRL = replace(
+    _GACRL_112K,
+    env=replace(_GACRL_112K.env, max_cycles=25),
+    training=replace(_GACRL_112K.training, env_steps=150_000),
+    preset="gacrl",
+)
+_GACRL_TEAMS = replace(
+    _GACRL_112K,
+    algorithm=replace(
+        _GACRL_112K.algorithm,
+        network=replace(_GACRL_112K.algorithm.network, nearest_landmarks=6, nearest_agents=8),
+    ),
+    env=replace(_GACRL_112K.env, num_agents=5, arena_scale=1.291),
+    preset="gacrl-teams",
+)
+"""The arena keeps the entities as dense as in the standard task: its side grows with the root of N / 3."""
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
         "gacrl": ("GACRL that solves the task: episodes of 25 steps", _GACRL),
         "gacrl-112k": ("GACRL that solves the task, on the paper's budget of 112,500 steps", _GACRL_112K),
+        "gacrl-teams": (
+            "GACRL for teams of any size: trained with 5 agents, each sees what is near",
+            _GACRL_TEAMS,
+        ),
         "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
         "vdn": ("VDN: the same learner, values summed", _VDN),
         "iql": ("IQL: the same learner, each agent for itself", _IQL),

@@ -46,7 +46,7 @@ class SpreadParams(NamedTuple):
     """0 is the first stage of MPE2's `curriculum`."""
     coverage_threshold: Float[Array, ""] | float = 0.5
     """θ of equation (1), of adaptive exploration and of the metric `coverage_theta`."""
-    coverage_bonus: Float[Array, ""] | float = 0.5
+    coverage_bonus: Float[Array, ""] | float = 1.0
     """Of the reward `coverage`: what a step with every landmark covered adds."""
     arena_scale: Float[Array, ""] | float = 1.0
     """Agents and landmarks start uniformly in [−arena_scale, arena_scale]²."""
