@@ -238,41 +238,41 @@ _IQL = _baseline("iql", _q("iql"), _OFF_POLICY)
 _COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds=2), _ON_POLICY)
 _DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
 
-_GACRL_112K = RunConfig(
-    algorithm=GacrlConfig(
-        network=NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete", rounds=2),
-        learning_rate=1e-3,
-        learning_rate_end=1e-4,
-        n_step=3,
-        augment=True,
-        double_q=False,
-        epsilon_end=0.02,
-        replay_capacity=150_000,
-        learning_starts=500,
-        batch_size=64,
-        updates=10,
-    ),
-    env=EnvConfig(max_cycles=75, reward="coverage"),
-    training=TrainingConfig(env_steps=112_500, num_envs=25, num_steps=1),
-    evaluation=EvaluationConfig(interval=7_500),
-    preset="gacrl-112k",
+
+def _gacrl(name: str, env: EnvConfig, env_steps: int = 112_500, **network: Any) -> RunConfig:
+    """GACRL as docs/design.md came to it."""
+    return RunConfig(
+        algorithm=GacrlConfig(
+            network=NetworkConfig(
+                torso="graph", width=32, latent="vae", communication="discrete", rounds=2, **network
+            ),
+            learning_rate=1e-3,
+            learning_rate_end=1e-4,
+            n_step=3,
+            augment=True,
+            double_q=False,
+            epsilon_end=0.02,
+            replay_capacity=150_000,
+            learning_starts=500,
+            batch_size=64,
+            updates=10,
+        ),
+        env=replace(env, reward="coverage"),
+        training=TrainingConfig(env_steps=env_steps, num_envs=25, num_steps=1),
+        evaluation=EvaluationConfig(interval=7_500),
+        preset=name,
+    )
+
+
+_GACRL = _gacrl("gacrl", EnvConfig(), env_steps=150_000)
+_GACRL_112K = _gacrl("gacrl-112k", EnvConfig(max_cycles=75))
+# Entities as dense as in the standard task: the arena's side grows with the root of their number.
+_GACRL_TEAMS = _gacrl(
+    "gacrl-teams",
+    EnvConfig(num_agents=5, arena_scale=1.291, max_cycles=75),
+    nearest_landmarks=6,
+    nearest_agents=8,
 )
-_GACRL = replace(
-    _GACRL_112K,
-    env=replace(_GACRL_112K.env, max_cycles=25),
-    training=replace(_GACRL_112K.training, env_steps=150_000),
-    preset="gacrl",
-)
-_GACRL_TEAMS = replace(
-    _GACRL_112K,
-    algorithm=replace(
-        _GACRL_112K.algorithm,
-        network=replace(_GACRL_112K.algorithm.network, nearest_landmarks=6, nearest_agents=8),
-    ),
-    env=replace(_GACRL_112K.env, num_agents=5, arena_scale=1.291),
-    preset="gacrl-teams",
-)
-"""The arena keeps the entities as dense as in the standard task: its side grows with the root of N / 3."""
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {

@@ -1,0 +1,7 @@
+"""`python -m gacrl` is `gacrl`."""
+
+import sys
+
+from gacrl.cli import main
+
+sys.exit(main())
