@@ -149,7 +149,7 @@ def test_scripted_policies_can_be_held_too():
     drawn = np.stack([random(observations, greedy=False) for _ in range(40)])
     assert set(np.unique(drawn)) == set(range(5))
     assert random.message is None
-    with pytest.raises(gacrl.UserError, match="the oracle needs the exact state"):
+    with pytest.raises(gacrl.UserError, match="oracle needs the exact state"):
         gacrl.load_policy("oracle")
 
 

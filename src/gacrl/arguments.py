@@ -64,8 +64,8 @@ class Resume:
 class Evaluate:
     """Measure a policy on fixed episodes: greedy and sampled, beside random, noop and oracle.
 
-    RUN is a run folder, FOLDER@k for its member k, or random, noop, oracle. Every score_ is 0 for random
-    and 1 for oracle on the same starts.
+    RUN is a run folder, FOLDER@k for its member k, or random, noop, oracle, or local (an oracle that sees what is
+    near and assigns nothing). Every score_ is 0 for random and 1 for oracle on the same starts.
 
     examples:
       gacrl evaluate runs/paper-1

@@ -270,8 +270,9 @@ _GACRL_112K = _gacrl("gacrl-112k", EnvConfig(max_cycles=75))
 _GACRL_TEAMS = _gacrl(
     "gacrl-teams",
     EnvConfig(num_agents=5, arena_scale=1.291, max_cycles=75),
-    nearest_landmarks=6,
-    nearest_agents=8,
+    env_steps=150_000,
+    nearest_landmarks=8,
+    nearest_agents=12,
 )
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(

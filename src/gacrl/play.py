@@ -174,12 +174,12 @@ class LoadedPolicy:
 def load_policy(run: str | Path) -> LoadedPolicy:
     """The policy of a run: its folder, `FOLDER@k`, or `random` and `noop`.
 
-    Raises UserError where there is no such run. The oracle needs the exact state, which observations alone
-    do not give: play it with `gacrl.envs.scripted`.
+    Raises UserError where there is no such run. The oracle and the local policy need the exact state, which
+    observations alone do not give: play them with `gacrl.envs.scripted`.
     """
-    if str(run) in scripted.SCRIPTED:
-        if str(run) == "oracle":
-            raise UserError("the oracle needs the exact state, not observations: use gacrl.envs.scripted")
+    if str(run) in scripted.PLAYABLE:
+        if str(run) not in ("random", "noop"):
+            raise UserError(f"{run} needs the exact state, not observations: use gacrl.envs.scripted")
         env = envs.make(EnvConfig())
         actor = scripted.make(str(run), env)
         return LoadedPolicy(env, dict.fromkeys((True, False), actor.policy), actor.initial_memory)

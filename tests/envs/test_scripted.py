@@ -10,6 +10,8 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist, pdist
 
+from gacrl import envs
+from gacrl.config import EnvConfig
 from gacrl.envs import scripted
 from gacrl.envs.particles import Physics
 from gacrl.envs.spread import Spread, SpreadParams, SpreadState, pack_state, unpack_state
@@ -36,18 +38,18 @@ def starts(num_envs: int, num_agents: int, num_landmarks: int, arena_scale: floa
     return places[:, :num_agents], places[:, num_agents:]
 
 
-def play_on(env: Spread, positions, landmarks, num_steps: int) -> np.ndarray:
-    """Where the oracle brings the agents that start at rest: [E N 2]."""
-    oracle = scripted.make("oracle", env)
+def play_on(env: Spread, positions, landmarks, num_steps: int, name: str = "oracle") -> np.ndarray:
+    """Where a scripted policy brings the agents that start at rest: [E N 2]."""
+    actor = scripted.make(name, env)
 
     def play(positions, landmarks):
         def step(loop, _):
             state, memory = loop
             observation = env.observe(state, env.default_params())
-            decision, memory = oracle.policy(memory, observation, KEY, QUIET)
+            decision, memory = actor.policy(memory, observation, KEY, QUIET)
             return (env.step(state, decision.action, KEY)[0], memory), None
 
-        start = at_rest(positions, landmarks), oracle.initial_memory
+        start = at_rest(positions, landmarks), actor.initial_memory
         return jax.lax.scan(step, start, length=num_steps)[0][0].positions
 
     return np.asarray(jax.jit(jax.vmap(play))(positions, landmarks))
@@ -60,7 +62,7 @@ def covered(positions: np.ndarray, landmarks: np.ndarray) -> float:
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(ValueError, match="no scripted policy 'orcale', only random, noop, oracle"):
+    with pytest.raises(ValueError, match="no scripted policy 'orcale', only random, noop, oracle, local"):
         scripted.make("orcale", Spread())
 
 
@@ -218,3 +220,28 @@ def test_large_teams_pay_for_the_assignment_once():
     np.testing.assert_array_equal(np.sort(landmarks), np.tile(np.arange(200), (2, 1)))
     np.testing.assert_array_equal(kept, landmarks)
     assert acting < 0.6 * assigning
+
+
+# The local policy
+
+
+def test_the_local_policy_leaves_a_landmark_to_who_is_nearer():
+    """Two agents left of two landmarks in a row: the nearer one takes the first, the other passes on to the second."""
+    env = Spread(2, 2, max_cycles=40)
+    positions = np.array([[[0.0, 0.0], [-0.4, 0.2]]])
+    landmarks = np.array([[[0.3, 0.0], [0.95, 0.3]]])
+    ends = play_on(env, positions, landmarks, 30, "local")
+    apart = np.linalg.norm(ends[0][:, None] - landmarks[0], axis=-1)
+    assert apart[0, 0] < 0.1
+    assert apart[1, 1] < 0.1
+
+
+def test_the_local_policy_lies_between_random_and_the_oracle():
+    env = envs.make(EnvConfig(num_agents=10, arena_scale=(10 / 3) ** 0.5))
+    positions, landmarks = starts(300, 10, 10, (10 / 3) ** 0.5)
+    ends = {
+        name: covered(play_on(env, positions, landmarks, 60, name), landmarks)
+        for name in ("random", "local", "oracle")
+    }
+    assert ends["random"] < 0.1
+    assert 0.7 < ends["local"] < ends["oracle"] - 0.05

@@ -1,9 +1,12 @@
-"""Policies that learn nothing: two floors, `random` and `noop`, and a ceiling, `oracle`.
+"""Policies that learn nothing: two floors, `random` and `noop`, a ceiling, `oracle`, and `local`, which sees little.
 
 The oracle reads the exact state, whatever the agents themselves observe. It assigns agents to landmarks once
 per episode, at the least total squared distance. Then each agent takes the push after which it would coast
 nearest to its target, where crowding another agent counts as distance. Targets leave room for two discs;
 landmarks need not. It is a strong heuristic and no optimum: a learned policy may beat it.
+
+The local one moves as the oracle does, but matches only what it has in sight, nearest pairs first, and anew in every
+step: what can be had in a large team without a view of the whole and without a word.
 """
 
 from typing import NamedTuple
@@ -19,6 +22,10 @@ from gacrl.envs.spread import CAPTURE_RADIUS, Spread, SpreadParams, SpreadState,
 from gacrl.types import Channel, Decision, Memory, Observation, Policy, PRNGKey
 
 SCRIPTED = ("random", "noop", "oracle")
+"""Stand beside every number."""
+PLAYABLE = (*SCRIPTED, "local")
+SIGHT = 5
+"""The local policy sees this many nearest landmarks, and as many nearest agents."""
 
 UNASSIGNED = -2
 """The oracle's memory before an episode's first step; -1 is `assign`'s mark of an agent without landmark."""
@@ -38,14 +45,14 @@ class Scripted(NamedTuple):
 
 
 def make(name: str, env: Spread) -> Scripted:
-    """The scripted policy of that name for this task; ValueError for a name that is not in `SCRIPTED`.
+    """The scripted policy of that name for this task; ValueError for a name that is not in `PLAYABLE`.
 
     The oracle takes physics and arena scale, which no observation tells, from `env.initial_params`; masks,
     places and velocities of agents and landmarks it reads from the observation.
     """
-    if name not in SCRIPTED:
-        raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(SCRIPTED)}.")
-    return {"random": _random, "noop": _noop, "oracle": _oracle}[name](env)
+    if name not in PLAYABLE:
+        raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(PLAYABLE)}.")
+    return {"random": _random, "noop": _noop, "oracle": _oracle, "local": _local}[name](env)
 
 
 def _random(env: Spread) -> Scripted:
@@ -71,7 +78,7 @@ def _noop(env: Spread) -> Scripted:
 
 def _oracle(env: Spread) -> Scripted:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
-    params, physics = env.initial_params, env.initial_params.physics
+    params = env.initial_params
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         if observation.state is None:
@@ -92,19 +99,73 @@ def _oracle(env: Spread) -> Scripted:
         landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
 
         free = ~(agents & (landmark >= 0) & wanted[landmark])
-        coasting, reach = _coast(state, physics)
+        coasting, _ = _coast(state, params.physics)
         target = _intercept(coasting, posts[landmark], motion[landmark], params)
-        target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
-
-        pushes = _pushes((target - coasting) / reach, env.continuous_actions)
-        outcomes = coasting[:, None] + reach * pushes
-        distance = _length(outcomes - target[:, None])
-        # The others are expected halfway between coasting on and what each would do if it were alone.
-        expected = (coasting + _row_choice(outcomes, distance.argmin(axis=1))) / 2
-        choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
-        return Decision(_as_action(_row_choice(pushes, choice), env.continuous_actions)), landmark
+        return Decision(_steer(env, state, agents, target, free)), landmark
 
     return Scripted(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
+
+
+def _local(env: Spread) -> Scripted:
+    """Each agent decides anew in every step, from the nearest landmarks and agents alone."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if observation.state is None:
+            raise ValueError("The local policy needs an environment that puts its state into the observation.")
+        state = unpack_state(observation.state, env.num_agents)
+        agents = observation.agent_mask
+        _, distance = pairwise_offsets(state.positions, state.landmarks)
+        distance = jnp.where(observation.landmark_mask, distance, jnp.inf)
+        _, between = pairwise_offsets(state.positions, state.positions)
+        between = jnp.where(_pairs(agents), between, jnp.inf)
+        nearest = lax.top_k(-distance, min(SIGHT, env.num_landmarks))[1]  # [N K]
+        others = lax.top_k(-between, min(SIGHT, env.num_agents - 1))[1]
+        there = jnp.take_along_axis(between, others, axis=1) < jnp.inf
+        group = jnp.concatenate([jnp.arange(env.num_agents)[:, None], others], axis=1)  # [N M], itself first
+        theirs = distance[group[:, :, None], nearest[:, None, :]]  # [N M K]
+        hidden = jnp.concatenate([jnp.zeros((env.num_agents, 1), bool), ~there], axis=1)
+        choice = jax.vmap(_greedy_match)(jnp.where(hidden[..., None], jnp.inf, theirs))
+        target = state.landmarks[jnp.take_along_axis(nearest, choice[:, None], axis=1)[:, 0]]
+        return Decision(_steer(env, state, agents, target, ~agents)), memory
+
+    return Scripted(policy, ())
+
+
+def _greedy_match(distance: Float[Array, "M K"]) -> Int[Array, ""]:
+    """The landmark of the first agent when the closest pair is matched first, and so on.
+
+    Where it is left without one: the last, the farthest in sight, away from the crowd.
+    """
+    num_landmarks = distance.shape[1]
+
+    def match(_: Int[Array, ""], loop: tuple[Array, Array]) -> tuple[Array, Array]:
+        left, mine = loop
+        agent, landmark = jnp.divmod(left.argmin(), num_landmarks)
+        mine = jnp.where((agent == 0) & (left[agent, landmark] < jnp.inf), landmark, mine)
+        return left.at[agent].set(jnp.inf).at[:, landmark].set(jnp.inf), mine
+
+    start = distance, jnp.asarray(num_landmarks - 1)
+    return lax.fori_loop(0, min(distance.shape), match, start)[1]
+
+
+def _steer(
+    env: Spread,
+    state: SpreadState,
+    agents: Bool[Array, " N"],
+    target: Float[Array, "N 2"],
+    free: Bool[Array, " N"],
+) -> Array:
+    """The actions that bring agents to their targets, out of each other's way; `free` ones stay where they like."""
+    physics = env.initial_params.physics
+    coasting, reach = _coast(state, physics)
+    target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
+    pushes = _pushes((target - coasting) / reach, env.continuous_actions)
+    outcomes = coasting[:, None] + reach * pushes
+    distance = _length(outcomes - target[:, None])
+    # The others are expected halfway between coasting on and what each would do if it were alone.
+    expected = (coasting + _row_choice(outcomes, distance.argmin(axis=1))) / 2
+    choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
+    return _as_action(_row_choice(pushes, choice), env.continuous_actions)
 
 
 def _posts(state: SpreadState, landmark_mask: Bool[Array, " L"]) -> tuple[Float[Array, "L 2"], Bool[Array, " L"]]:

@@ -17,7 +17,7 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.messages import bits_used
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.play import TrainedRun, open_run
-from gacrl.training.session import evaluate_scripted
+from gacrl.training.session import play_scripted
 from gacrl.types import Memory, Policy
 
 Warn = Callable[[str], None]
@@ -55,10 +55,11 @@ def score_run(
     """
     changes = changes or Changes()
     messages = None
-    if run in scripted.SCRIPTED:
+    if run in scripted.PLAYABLE:
         env = envs.make(changes.apply(EnvConfig()))
         references = _references(env, episodes, backend)
-        final = {"greedy": over_seeds({name: np.array([value]) for name, value in references[run].items()})}
+        metrics = references.get(run) or _scripted(run, env, episodes, backend)
+        final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
         opened = open_run(run, changes.apply, warn)
         env = opened.env
@@ -104,7 +105,7 @@ def record_run(
     changes = changes or Changes()
     policy: Policy
     memory: Memory
-    if run in scripted.SCRIPTED:
+    if run in scripted.PLAYABLE:
         env = envs.make(changes.apply(EnvConfig()))
         policy, memory = scripted.make(run, env)
     else:
@@ -127,11 +128,12 @@ def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: str) -> 
 
 
 def _references(env: Spread, episodes: int, backend: str) -> dict[str, dict[str, float]]:
+    return {name: _scripted(name, env, episodes, backend) for name in scripted.SCRIPTED}
+
+
+def _scripted(name: str, env: Spread, episodes: int, backend: str) -> dict[str, float]:
     if backend == "jax":
-        return evaluate_scripted(env, episodes)
-    references: dict[str, dict[str, float]] = {}
-    for name in scripted.SCRIPTED:
-        policy, memory = scripted.make(name, env)
-        metrics = mpe2.evaluate(env, policy, memory, stream_key("report"), episodes)
-        references[name] = {metric: float(values.mean()) for metric, values in metrics.items()}
-    return references
+        return play_scripted(name, env, episodes)
+    policy, memory = scripted.make(name, env)
+    metrics = mpe2.evaluate(env, policy, memory, stream_key("report"), episodes)
+    return {metric: float(values.mean()) for metric, values in metrics.items()}

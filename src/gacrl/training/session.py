@@ -205,15 +205,13 @@ def _finish(
 
 def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, float]]:
     """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
-    return {
-        name: {
-            metric: float(np.mean(values))
-            for metric, values in scripted_program(name, env, num_episodes)(
-                env.default_params(), stream_key("report")
-            ).items()
-        }
-        for name in scripted.SCRIPTED
-    }
+    return {name: play_scripted(name, env, num_episodes) for name in scripted.SCRIPTED}
+
+
+def play_scripted(name: str, env: Spread, num_episodes: int) -> dict[str, float]:
+    """The metrics of one scripted policy there."""
+    metrics = scripted_program(name, env, num_episodes)(env.default_params(), stream_key("report"))
+    return {metric: float(np.mean(values)) for metric, values in metrics.items()}
 
 
 @cache
