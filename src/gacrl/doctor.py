@@ -84,14 +84,14 @@ def trial(algorithm: AlgorithmConfig) -> Trial:
     it learns fast, from the first step on."""
     if isinstance(algorithm, GacrlPaperConfig):
         return Trial(algorithm, 1_500)
-    network = replace(algorithm.network, width=32)
+    network = replace(algorithm.network, width=32, nearest_landmarks=None, nearest_agents=None)
     if isinstance(algorithm, PpoConfig):
         return Trial(replace(algorithm, network=network), 40, 128)
     algorithm = replace(algorithm, network=network, learning_starts=0, updates=8)
     if isinstance(algorithm, QmixConfig):
         window = min(algorithm.sequence_length, 2)
         return Trial(replace(algorithm, sequence_length=window, batch_size=32, learning_rate=5e-3), 60, 64)
-    return Trial(replace(algorithm, learning_rate=2e-3), 150, 64)
+    return Trial(replace(algorithm, network=network, batch_size=128, learning_rate=2e-3), 150, 64)
 
 
 def _learns(preset: str, asked: Trial) -> Iterator[Finding]:

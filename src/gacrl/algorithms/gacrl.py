@@ -3,7 +3,7 @@
 - Latent code and discrete messages over the proximity graph, as the paper's (2) to (9): `networks.agent`, with an
   entity graph for a torso, straight-through symbols, and receivers that know where the speaker stands.
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
-  learned from replay by double Q-learning. V sees all agents and is for training only; the maximum over joint
+  learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
   actions stays each agent's own argmax, so that execution is decentralised.
 - Exploration that adapts to coverage (13) to (16): `exploration.adaptive`.
 """

@@ -32,6 +32,7 @@ def evaluate(
     worlds = [_World(env, _FIRST_SEED + episode) for episode in range(num_episodes)]
     params = env.default_params()
     act = jax.jit(jax.vmap(lambda memory, seen, key: policy(memory, seen, key, Channel())))
+    observe = jax.jit(jax.vmap(lambda state: env.observe(state, params)))
     measures = sorted(jax.eval_shape(lambda: env.measure(env.reset(key)[0], params)))
 
     @jax.jit
@@ -44,8 +45,7 @@ def evaluate(
     going = np.ones(num_episodes, bool)
     for step_key in jax.random.split(key, env.max_cycles):
         state = _stacked(worlds)
-        seen = jax.vmap(lambda state: env.observe(state, params))(state)
-        seen = seen._replace(features=jnp.stack([world.features for world in worlds]))
+        seen = observe(state)._replace(features=jnp.stack([world.features for world in worlds]))
         decision, memory = act(memory, seen, jax.random.split(step_key, num_episodes))
         actions = np.asarray(decision.action)
         rewards = [world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)]
