@@ -45,7 +45,7 @@ def evaluate(
     going = np.ones(num_episodes, bool)
     for step_key in jax.random.split(key, env.max_cycles):
         state = _stacked(worlds)
-        seen = observe(state)._replace(features=jnp.stack([world.features for world in worlds]))
+        seen = observe(state)._replace(features=jnp.asarray(np.stack([world.features for world in worlds])))
         decision, memory = act(memory, seen, jax.random.split(step_key, num_episodes))
         actions = np.asarray(decision.action)
         rewards = [world.step(actions[i]) if going[i] else 0.0 for i, world in enumerate(worlds)]
