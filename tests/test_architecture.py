@@ -23,6 +23,7 @@ LAYERS = (
     ("training",),
     ("experiments", "play", "api"),
     ("cli", "progress", "doctor"),
+    ("__main__",),
 )
 """A room may import from its own layer and those above it in this list."""
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}

@@ -22,7 +22,7 @@ COMMANDS = [
 ]
 PYTHON = [block for language, block in BLOCKS if language == "python"]
 
-LONG = {"doctor", "reproduce", "sweep"}
+LONG = {"ablate", "doctor", "reproduce", "sweep"}
 """Minutes each: the first is below, the others have tests of their own in tests/experiments."""
 
 pytestmark = pytest.mark.xdist_group("readme")
