@@ -46,7 +46,7 @@ def room(tmp_path_factory, quick_start):
 
     presets = {name: ("short", short(config.preset(name))) for name in ("paper", "gacrl")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(config, "PRESETS", MappingProxyType(presets))
+        patch.setattr(config, "PRESETS", MappingProxyType({**config.PRESETS, **presets}))
         patch.chdir(tmp_path_factory.mktemp("readme"))
         yield
 

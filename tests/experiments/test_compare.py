@@ -329,7 +329,7 @@ def test_a_run_that_has_not_ended_is_refused(make_run: MakeRun, refused: Callabl
             "line 2 of {file} is not an evaluation with greedy",
         ),
         ("metrics.jsonl", lambda t: "{\n" + t, "line 1 of {file} is damaged: "),
-        ("metrics.jsonl", lambda t: "3\n" + t, "line 1 of {file} is not an evaluation with greedy"),
+        ("metrics.jsonl", lambda t: "3\n" + t, "line 1 of {file} is damaged: it is not an object"),
         ("metrics.jsonl", lambda t: None, "cannot read {file}: No such file or directory"),
         ("summary.json", lambda t: t.replace("-8.0", "NaN", 1), "{file} has nan as return_agent_mean of seed 0"),
         ("summary.json", lambda t: t.replace("-8.0, ", "", 1), "{file} has no greedy return_agent_mean of seed 4"),

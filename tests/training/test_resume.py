@@ -200,6 +200,23 @@ def test_an_extension_that_dies_before_its_first_checkpoint_goes_on(uninterrupte
     assert found.fingerprint == configuration.fingerprint(longer)
 
 
+def test_a_run_made_before_a_setting_was_added_can_go_on(tmp_path: Path):
+    """What its checkpoints belong to is what stands in its file, before and after an extension."""
+    config = configuration.preset("paper")
+    folder = RunFolder.create(tmp_path / "run", config)
+    older = json.loads(folder.config_file.read_text(encoding="utf-8"))
+    assert configuration.fingerprint(folder.settings()) == configuration.fingerprint(config)
+    del older["env"]["coverage_bonus"]
+    folder.config_file.write_text(json.dumps(older), encoding="utf-8")
+    made_then = configuration.fingerprint(older)
+    assert made_then != configuration.fingerprint(config)
+    assert configuration.fingerprint(folder.settings()) == made_then
+    folder.extend(999)
+    assert "coverage_bonus" not in folder.settings()["env"]
+    assert configuration.fingerprint(folder.settings()) == made_then
+    assert folder.config().training.env_steps == 999
+
+
 # Checkpoints by themselves.
 
 STATE = {

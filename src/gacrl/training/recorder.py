@@ -69,6 +69,11 @@ class RunFolder:
         except ConfigError as error:
             raise UserError(str(error)) from error
 
+    def settings(self) -> dict[str, Any]:
+        """The same as they stand in the file: a version that knows more settings does not add to them."""
+        self.config()  # refuses what is no configuration
+        return json.loads(self.config_file.read_text(encoding="utf-8"))
+
     @contextmanager
     def locked(self) -> Generator[None]:
         """Hold the folder for one writing process; the system frees the lock of one that died."""
@@ -98,7 +103,10 @@ class RunFolder:
         rows: list[dict[str, Any]] = []
         for number, line in enumerate(lines, start=1):
             try:
-                rows.append(json.loads(line))
+                row = json.loads(line)
+                if not isinstance(row, dict):
+                    raise ValueError("it is not an object")
+                rows.append(row)  # pyright: ignore[reportUnknownArgumentType]
             except ValueError as error:
                 if number < len(lines):
                     raise UserError(f"line {number} of {self.metrics_file} is damaged: {error}") from error
@@ -109,9 +117,11 @@ class RunFolder:
         rows = [row for row in self.metrics() if row["env_steps"] <= env_steps]
         self._replace(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
 
-    def write_config(self, config: RunConfig) -> None:
-        """Replace the settings (an extended run has more steps)."""
-        self._replace(self.config_file, configuration.dumps(config))
+    def extend(self, env_steps: int) -> None:
+        """Set the planned environment steps anew; every other setting stays as it stands in the file."""
+        settings = self.settings()
+        settings["training"] = {**settings.get("training", {}), "env_steps": env_steps}
+        self._replace(self.config_file, json.dumps(settings, indent=2) + "\n")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Replace `summary.json`."""

@@ -103,7 +103,7 @@ def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = 
     """Train from the beginning, into a new run folder."""
     folder = RunFolder.create(out, config)
     with folder.locked():
-        return _run(folder, config, None, watcher or Watcher())
+        return _run(folder, config, None, watcher or Watcher(), configuration.fingerprint(config))
 
 
 def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
@@ -112,7 +112,7 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     folder = RunFolder.open(path)
     with folder.locked():
         config = folder.config()
-        fingerprint = configuration.fingerprint(config)
+        fingerprint = configuration.fingerprint(folder.settings())
         found: checkpoint.Checkpoint | None = None
         if any(folder.checkpoints.glob("step-*")):
             found, warnings = checkpoint.newest(folder.checkpoints)
@@ -126,11 +126,17 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-            folder.write_config(config)
-        return _run(folder, config, found, watcher)
+            folder.extend(steps)
+        return _run(folder, config, found, watcher, fingerprint)
 
 
-def _run(folder: RunFolder, config: RunConfig, found: checkpoint.Checkpoint | None, watcher: Watcher) -> Run:
+def _run(
+    folder: RunFolder,
+    config: RunConfig,
+    found: checkpoint.Checkpoint | None,
+    watcher: Watcher,
+    fingerprint: str,
+) -> Run:
     trainer = build(config)
     watcher.planned(folder, config, plan(trainer, config))
     try:
@@ -148,7 +154,7 @@ def _run(folder: RunFolder, config: RunConfig, found: checkpoint.Checkpoint | No
                 folder.checkpoints,
                 without_padding(state, config.num_seeds),
                 env_steps,
-                configuration.fingerprint(config),
+                fingerprint,
                 vars(clock),
             )
             watcher.progress(progress)
