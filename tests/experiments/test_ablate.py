@@ -134,6 +134,17 @@ def test_the_command_says_what_each_part_is_worth(
     assert "holds another ablation" in capsys.readouterr().err
 
 
+def test_there_is_nothing_to_compare_with_where_the_whole_diverges(
+    trained: list[RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    preset = configuration.preset("gacrl-112k")
+    bare = replace(preset, env=replace(preset.env, reward="mpe2"))
+    monkeypatch.setattr(configuration, "preset", lambda name="gacrl": bare)
+    assert main(["ablate", "--part", YOKED, "--out", str(tmp_path / "out")]) == 2
+    assert "nothing to compare with: with all parts, seed 0 diverged" in capsys.readouterr().err
+    assert len(trained) == 1
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

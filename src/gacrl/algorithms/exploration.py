@@ -158,8 +158,8 @@ def adaptive(
     def level(state: Follower, env_steps: Int[Array, ""]) -> Level:
         coverage = state.coverage
         if recorded:
-            stretch = env_steps * len(recorded) // planned_steps
-            coverage = jnp.asarray(recorded)[jnp.clip(stretch, 0, len(recorded) - 1)]
+            stretch = env_steps // -(-planned_steps // len(recorded))
+            coverage = jnp.asarray(recorded)[jnp.minimum(stretch, len(recorded) - 1)]
         missing = jnp.square(1.0 - coverage)
         return Level(*(end + (start - end) * missing for start, end in (epsilon, temperature)))
 

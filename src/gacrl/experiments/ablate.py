@@ -141,6 +141,9 @@ def ablate(
     watch.planned([run.name for run in runs])
     if not train_missing(runs[:1], watch):
         return None
+    because = why_diverged(runs[0].folder)
+    if because is not None:
+        raise UserError(f"there is nothing to compare with: with all parts, {because}")
     runs = [_yoked(run, runs[0]) if run.name == YOKED else run for run in runs]
     refuse_other_settings(runs)
     if not train_missing(runs[1:], watch):
