@@ -48,12 +48,14 @@ def solve(preset: str, seed: int, limit: float, cache: Path | None) -> tuple[Rea
         begun = time.perf_counter()
         with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
             seen: list[tuple[float, int, float]] = []
-            while process.poll() is None and time.perf_counter() - begun < limit and 0.9 not in reached(seen):
+            going = True
+            while going:
                 time.sleep(0.05)
-                lines = rows(folder / "metrics.jsonl")
-                for row in lines[len(seen) :]:
-                    covered = row["greedy"]["coverage_final_0.1"]
-                    seen.append((time.perf_counter() - begun, row["env_steps"], covered))
+                ended = process.poll() is not None  # looked at first: what it wrote last is read below
+                now = time.perf_counter() - begun
+                for row in rows(folder / "metrics.jsonl")[len(seen) :]:
+                    seen.append((now, row["env_steps"], row["greedy"]["coverage_final_0.1"]))
+                going = not ended and now < limit and LEVELS[-1] not in reached(seen)
             process.kill()
     return reached(seen), seen[0][0] if seen else float("nan")
 
