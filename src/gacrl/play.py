@@ -19,7 +19,7 @@ from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
 from gacrl.training import checkpoint, session
-from gacrl.training.devices import one_seed
+from gacrl.training.devices import one_seed, rows
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
 from gacrl.types import Channel, Memory, Policy
@@ -81,7 +81,7 @@ def open_run(
             raise UserError(f"{path} has the members 0 to {config.num_seeds - 1}: there is no @{member}")
         changed = replace(changed, seed=config.seed + member, num_seeds=1)
         trainer = session.build(changed)
-        learners = jax.tree.map(lambda leaf: leaf[member : member + 1], jax.device_get(learners))
+        learners = rows(learners, member, member + 1)
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
 
@@ -118,7 +118,7 @@ def save_policy(run: str | Path, out: Path) -> Path:
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
     skip = tuple(f".learner{name}" for name in session.FOR_LEARNING)
-    state, fingerprint = _Acting(jax.tree.map(jnp.asarray, opened.learners)), configuration.fingerprint(config)
+    state, fingerprint = _Acting(opened.learners), configuration.fingerprint(config)
     checkpoint.save(out / "checkpoints", state, opened.env_steps, fingerprint, {}, skip)
     return out
 

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageColor, ImageDraw, ImageFont
@@ -378,5 +377,7 @@ def _count(number: int, noun: str) -> str:
 @functools.cache
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib: the same everywhere, and it has every letter of a title."""
+    import matplotlib  # a fifth of a second, which no run waits for at its start
+
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), max(size, 1))

@@ -467,7 +467,7 @@ class Updates:
     """(rows, temperature, noise) as each update hands them to the loss."""
 
 
-_, UNPACK = replay.packing(gacrl_paper.no_experience(N, 18))
+_, UNPACK = replay.packing(lambda: gacrl_paper.no_experience(N, 18))
 COVERAGE = (1 / 3, 2 / 3, 1 / 3)
 STORED = np.array([100.0, 101.0, 102.0])
 

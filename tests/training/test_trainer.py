@@ -91,8 +91,18 @@ def test_a_second_chunk_compiles_nothing_whatever_its_length(
     assert len(counts) == 3
     assert counts[0] > 0, "compiling is seen"
     assert compiled(caplog.records)[counts[0] :] == []
-    assert first_traces > 0
-    assert traced == first_traces
+    assert first_traces == traced == 1
+
+
+def test_a_start_compiles_no_program_for_each_leaf(caplog: pytest.LogCaptureFixture):
+    """Most of a start went into hundreds of tiny programs once."""
+    config = replace(SMALL, num_seeds=3)
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        state = session.build(config).init(config.seeds)
+        one_seed(state, 2)
+        without_padding(state, 3)
+    assert len(jax.tree.leaves(state)) > 40
+    assert 0 < len(compiled(caplog.records)) < 16
 
 
 # Seeds.

@@ -139,9 +139,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         step = Transition(observation, Decision(choice), after.reward, false, false, false, after.observation, {})
         return Experience(step, nothing_remembered)
 
-    packed, unpack = ring.packing(
-        jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(example))
-    )
+    packed_size, unpack = ring.packing(example)
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         network = parts.networks(key)
@@ -149,7 +147,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
             network=network,
             target=network,
             optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            replay=ring.empty(jnp.zeros((num_envs, packed.size)), rows),
+            replay=ring.empty(jnp.zeros((num_envs, packed_size)), rows),
             rewards=no_returns(),
             exploration=parts.exploration.init(),
             env_steps=jnp.zeros((), jnp.int32),

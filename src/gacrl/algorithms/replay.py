@@ -89,6 +89,13 @@ def pack(item: object) -> Float[Array, " W"]:
     return ravel_pytree(item)[0]
 
 
-def packing(example: Item) -> tuple[Float[Array, " W"], Callable[[Float[Array, " W"]], Item]]:
-    """An empty item as a vector, and the inverse of `pack`."""
-    return ravel_pytree(jax.tree.map(jnp.zeros_like, example))
+def packing(example: Callable[[], Item]) -> tuple[int, Callable[[Float[Array, " W"]], Item]]:
+    """The length of an item as a vector, and the inverse of `pack`; nothing is computed, only shapes are looked at."""
+    inverses: list[Callable[[Float[Array, " W"]], Item]] = []
+
+    def packed() -> Float[Array, " W"]:
+        vector, unpack = ravel_pytree(example())
+        inverses.append(unpack)
+        return vector
+
+    return jax.eval_shape(packed).size, inverses[0]

@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,12 @@ def devices_for(num_seeds: int) -> list[Any]:
     return jax.local_devices()[: min(num_seeds, jax.local_device_count())]
 
 
+@jax.jit
 def stack_seeds(members: list[PyTree]) -> PyTree:
-    """Pytrees of single seeds as one, with the seeds in front of every axis."""
+    """Pytrees of single seeds as one, with the seeds in front of every axis.
+
+    One program, as is each of those below: leaf by leaf a start would compile hundreds of tiny ones.
+    """
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
 
@@ -65,38 +70,66 @@ def shard_seeds(stacked: PyTree, num_seeds: int) -> PyTree:
     Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
     """
     devices = devices_for(num_seeds)
-    members = jnp.minimum(jnp.arange(num_seeds + -num_seeds % len(devices)), num_seeds - 1)
-    mesh = Mesh(np.asarray(devices), ("seeds",))
-    padded = jax.tree.map(lambda leaf: leaf[members], stacked)
-    return jax.device_put(padded, NamedSharding(mesh, PartitionSpec("seeds")))
+    sharding = NamedSharding(Mesh(np.asarray(devices), ("seeds",)), PartitionSpec("seeds"))
+    if len(devices) == 1:
+        return jax.device_put(stacked, sharding)
+    parts = map(jax.device_put, _split(stacked, len(devices)), devices)
+
+    def whole(*shards: jax.Array) -> jax.Array:
+        shape = (len(shards) * shards[0].shape[0], *shards[0].shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, sharding, list(shards))
+
+    return jax.tree.map(whole, *parts)
+
+
+@partial(jax.jit, static_argnums=1)
+def _split(stacked: PyTree, parts: int) -> list[PyTree]:
+    """Equal parts of the seeds, the last seed repeated until they are equal."""
+
+    def part(leaf: jax.Array, number: int) -> jax.Array:
+        padded = jnp.concatenate([leaf, *[leaf[-1:]] * (-leaf.shape[0] % parts)])
+        return jnp.split(padded, parts)[number]
+
+    return [jax.tree.map(partial(part, number=number), stacked) for number in range(parts)]
 
 
 def one_seed(stacked: PyTree, member: int) -> PyTree:
     """A single seed of a stacked pytree, on one device."""
-    return jax.tree.map(lambda leaf: _rows(leaf, member, member + 1)[0], stacked)
+    return _only(rows(stacked, member, member + 1))
 
 
 def without_padding(stacked: PyTree, num_seeds: int) -> PyTree:
     """The real seeds of a sharded pytree, on one device."""
-    return jax.tree.map(lambda leaf: _rows(leaf, 0, num_seeds), stacked)
+    return rows(stacked, 0, num_seeds)
 
 
-def _rows(leaf: Any, start: int, stop: int) -> jax.Array:
-    """Rows of a sharded array, on one device, fetched shard by shard.
+def rows(stacked: PyTree, start: int, stop: int) -> PyTree:
+    """The seeds from `start` up to `stop` of a sharded pytree, on one device, fetched shard by shard.
 
-    Indexing the sharded array itself would make its devices wait for each other, and XLA ends the process when
-    one of them, on a busy machine, is late by 40 seconds.
+    Indexing the sharded arrays themselves would make their devices wait for each other, and XLA ends the process
+    when one of them, on a busy machine, is late by 40 seconds.
     """
+    leaves, structure = jax.tree.flatten(stacked)
     home = jax.local_devices()[0]
-    if not isinstance(leaf, jax.Array) or len(leaf.sharding.device_set) == 1:
-        return jax.device_put(leaf[start:stop], home)
-    parts: list[jax.Array] = []
-    for shard in sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start or 0):
-        first = shard.index[0].start or 0
-        wanted = slice(max(start - first, 0), max(stop - first, 0))
-        if wanted.start < min(wanted.stop, shard.data.shape[0]):
-            parts.append(jax.device_put(shard.data[wanted], home))
-    return jnp.concatenate(parts)
+    fetched: list[list[jax.Array]] = []
+    before = 0
+    for leaf in leaves:
+        shards = sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start or 0)
+        held = leaf.shape[0] // len(shards)
+        first, last = start // held, (stop - 1) // held
+        fetched.append([jax.device_put(shard.data, home) for shard in shards[first : last + 1]])
+        before = first * held
+    return structure.unflatten(_joined(fetched, start - before, stop - before))
+
+
+@jax.jit
+def _only(stacked: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[0], stacked)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _joined(parts: list[list[jax.Array]], start: int, stop: int) -> list[jax.Array]:
+    return [jnp.concatenate(leaf)[start:stop].copy() for leaf in parts]
 
 
 def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:

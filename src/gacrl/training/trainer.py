@@ -158,11 +158,12 @@ class Trainer:
 
     def chunk_of_one(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
         """`num_updates` turns of the loop, for one seed."""
+        update = jax.jit(self._update, inline=True)  # traced once for the shapes and the loop
 
         def body(_: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams]):
             state, seen, totals, _ = loop
             used = state.env_params
-            state, episodes, metrics = self._update(state)
+            state, episodes, metrics = update(state)
             seen = EpisodeSummary(
                 ended=seen.ended + episodes.ended,
                 total=seen.total + episodes.total,
@@ -171,7 +172,7 @@ class Trainer:
             )
             return state, seen, jax.tree.map(jnp.add, totals, metrics), used
 
-        shapes = jax.eval_shape(lambda: self._update(state)[2])
+        shapes = jax.eval_shape(update, state)[2]
         zeros: PyTree = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         state, seen, totals, used = jax.lax.fori_loop(
             0, num_updates, body, (state, no_episodes(self.measures), zeros, state.env_params)
