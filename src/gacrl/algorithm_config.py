@@ -136,6 +136,8 @@ class LearningConfig:
     """Longer gradients are shortened to this norm."""
     augment: bool = False
     """Turn what is learned from by a random one of the task's symmetries."""
+    symmetric_play: bool = False
+    """Play greedily by the mean over the task's symmetries, eight for spread: eight times the messages."""
     reward: Literal["team", "own"] = "team"
     """Every agent earns the team's mean reward, or its own."""
 
@@ -143,6 +145,10 @@ class LearningConfig:
         between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "gamma")
         between("algorithm", self, 0, 1_000, "n_step")
         between("algorithm", self, 1e-6, 1e6, "max_grad_norm")
+        require(
+            not (self.symmetric_play and (self.network.recurrent or self.network.communication == "dial")),
+            "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network or DIAL",
+        )
 
 
 @dataclass(frozen=True)

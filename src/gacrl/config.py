@@ -250,6 +250,7 @@ def _gacrl(name: str, env: EnvConfig, env_steps: int = 112_500, **network: Any) 
             learning_rate_end=1e-4,
             n_step=3,
             augment=True,
+            symmetric_play=True,
             double_q=False,
             epsilon_end=0.02,
             replay_capacity=150_000,

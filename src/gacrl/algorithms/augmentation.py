@@ -1,11 +1,16 @@
-"""More experience from the same steps: the task turned by one of its symmetries is the same task."""
+"""What the symmetries of a task are good for: a turned world is the same task.
+
+More experience from the same steps, and a policy that is symmetric by construction.
+"""
 
 import jax
-from jaxtyping import Array, Int
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import actions
 from gacrl.envs.environment import Environment, SpatialEnvironment
-from gacrl.types import PRNGKey, Transition
+from gacrl.networks.agent import AgentNetwork, AgentOutput
+from gacrl.types import Channel, Memory, Observation, PRNGKey, Transition
 
 
 def turn_experience(env: Environment, steps: Transition, key: PRNGKey) -> Transition:
@@ -27,3 +32,30 @@ def turn_experience(env: Environment, steps: Transition, key: PRNGKey) -> Transi
         )
 
     return jax.vmap(turn, (1, 0), 1)(steps, symmetries)
+
+
+def play(
+    env: Environment,
+    symmetric: bool,
+    network: AgentNetwork,
+    observation: Observation,
+    memory: Memory,
+    channel: Channel,
+    temperature: Float[Array, ""] | float = 1.0,
+) -> tuple[AgentOutput, Memory]:
+    """What the network puts out when nothing is drawn.
+
+    `symmetric` (and without a memory): its head [N, A] is the mean over the turned worlds, turned back, so that
+    when the world turns the actions do. Every turned world has a conversation of its own: all that is computed and
+    sent grows by the number of symmetries. The message shown is the one of the world as it is.
+    """
+    if not symmetric or not isinstance(env, SpatialEnvironment):
+        return network(observation, memory, None, channel, temperature)
+    choices = actions.choices(env)
+
+    def turned(symmetry: Int[Array, ""]) -> AgentOutput:
+        output, _ = network(env.turn(observation, symmetry), (), None, channel, temperature)
+        return output._replace(head=output.head[:, choices.turn(jnp.arange(choices.size), symmetry)])
+
+    outputs = jax.vmap(turned)(jnp.arange(env.num_symmetries))
+    return jax.tree.map(lambda leaf: leaf[0], outputs)._replace(head=outputs.head.mean(0)), memory

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from gacrl.algorithm_config import PpoConfig
 from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
-from gacrl.algorithms.augmentation import turn_experience
+from gacrl.algorithms.augmentation import play, turn_experience
 from gacrl.algorithms.exploration import progress_between
 from gacrl.algorithms.objectives import (
     ValueNorm,
@@ -188,9 +188,11 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         ) -> tuple[Decision, Memory]:
             actor_memory, critic_memory = split_memory(memory)
             talk_key, choice_key = jax.random.split(key)
-            output, actor_memory = learner.network.actor(
-                observation, actor_memory, talk_key if explore else None, channel
-            )
+            actor = learner.network.actor
+            if explore:
+                output, actor_memory = actor(observation, actor_memory, talk_key, channel)
+            else:
+                output, actor_memory = play(env, config.symmetric_play, actor, observation, actor_memory, channel)
             log_probs = log_policy(output.head, actions.mask(observation.action_mask))
             choice = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
             value, critic_memory = learner.network.critic(observation, critic_memory)

@@ -18,7 +18,7 @@ from gacrl.algorithm_config import QLearningConfig
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import choices
 from gacrl.algorithms.algorithm import Algorithm
-from gacrl.algorithms.augmentation import turn_experience
+from gacrl.algorithms.augmentation import play, turn_experience
 from gacrl.algorithms.exploration import Exploration, progress_between
 from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
 from gacrl.algorithms.returns import n_step_window
@@ -164,20 +164,22 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
             remembered = memory if isinstance(memory, ActMemory) else ActMemory((), ())
             mode_key, talk_key, action_key = jax.random.split(key, 3)
             mode = remembered.exploration
-            output, after = network.agent(
-                observation, remembered.network, talk_key if explore else None, channel, level.temperature
-            )
+            before, temperature = remembered.network, level.temperature
             if explore:
+                output, after = network.agent(observation, before, talk_key, channel, temperature)
                 mode, epsilon = parts.exploration.begin(mode, mode_key, level.epsilon)
                 choice = epsilon_greedy(action_key, output.head, actions.mask(observation.action_mask), epsilon)
             else:
+                output, after = play(
+                    env, config.symmetric_play, network.agent, observation, before, channel, temperature
+                )
                 choice = greedy(output.head, actions.mask(observation.action_mask))
             best = greedy(output.head, actions.mask(observation.action_mask))
             value = parts.team_value(network, output, best, observation).mean()
             extras = {
                 "value": jnp.broadcast_to(value, choice.shape),
                 "choice": choice,
-                "memory": remembered.network,
+                "memory": before,
                 "mode": mode,
             }
             decision = Decision(actions.act(choice), output.message, output.adjacency, extras)

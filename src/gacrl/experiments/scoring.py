@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from gacrl import envs
+from gacrl.algorithm_config import LearningConfig
 from gacrl.config import EnvConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
@@ -83,13 +84,14 @@ def score_run(
 
 def _messages(opened: TrainedRun) -> dict[str, float] | None:
     """Bits that an agent of the first member sends in a step of greedy play, and how many a good code would need."""
-    network = getattr(opened.config.algorithm, "network", None)
-    if network is None or network.communication != "discrete":
+    config = opened.config.algorithm
+    if not isinstance(config, LearningConfig) or config.network.communication != "discrete":
         return None
     env, policy = opened.env, opened.policy(0, False)
     key = stream_key("report")
     heard = recording.record_many(env, policy, opened.trainer.memory, env.default_params(), key, _HEARD)
-    sent = network.rounds * float(np.log2(network.vocabulary))
+    conversations = env.num_symmetries if config.symmetric_play else 1
+    sent = conversations * config.network.rounds * float(np.log2(config.network.vocabulary))
     used = bits_used(heard)
     return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
 

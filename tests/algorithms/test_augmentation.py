@@ -1,0 +1,77 @@
+"""Playing by the mean over the turned worlds: a policy that is symmetric by construction."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import drawn_learner
+
+from gacrl import config as configuration
+from gacrl.algorithm_config import LearningConfig, NetworkConfig
+from gacrl.algorithms import algorithm as algorithms
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.config import TrainingConfig
+from gacrl.envs.spread import Spread
+from gacrl.errors import ConfigError
+from gacrl.types import Channel
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+TRAINING = TrainingConfig(env_steps=100, num_envs=2, num_steps=4)
+
+
+def made(preset: str, env: Spread, symmetric: bool) -> Algorithm:
+    config = configuration.preset(preset).algorithm
+    assert isinstance(config, LearningConfig)
+    network = replace(config.network, width=8)
+    return algorithms.make(replace(config, network=network, symmetric_play=symmetric), env, TRAINING)
+
+
+@pytest.mark.parametrize(("preset", "continuous"), [("gacrl", False), ("gacrl", True), ("mappo", False)])
+def test_when_the_world_turns_the_actions_turn(preset: str, continuous: bool):
+    """In 32 worlds turned in all eight ways; the same networks played plainly do something else in many of them."""
+    env = Spread(num_agents=3, num_landmarks=2, continuous_actions=continuous)
+    seen = jax.vmap(lambda key: env.reset(key)[1])(jax.random.split(jax.random.key(0), 32))
+    symmetries = jnp.arange(env.num_symmetries)
+
+    def kept(symmetric: bool) -> float:
+        """Share of the actions that are those of the world as it is, turned."""
+        algorithm = made(preset, env, symmetric)
+        memory = algorithm.initial_memory(3)
+        policy = algorithm.policy(drawn_learner(algorithm), False)
+
+        def act(observation):
+            return policy(memory, observation, jax.random.key(0), Channel())[0].action
+
+        def both(observation, symmetry):
+            turned = act(env.turn(observation, symmetry))
+            return jnp.isclose(turned, env.turn_action(act(observation), symmetry))
+
+        return jax.jit(jax.vmap(jax.vmap(both, (None, 0)), (0, None)))(seen, symmetries).mean()
+
+    assert kept(symmetric=True) == 1.0
+    assert kept(symmetric=False) < 0.9
+
+
+def test_it_is_the_mean_over_eight_conversations():
+    """By hand: the network asked in each turned world, its numbers turned back."""
+    env = Spread(num_agents=3, num_landmarks=3)
+    algorithm, (_, seen) = made("gacrl", env, symmetric=True), env.reset(jax.random.key(3))
+    learner = drawn_learner(algorithm)
+    decision, _ = algorithm.policy(learner, False)(algorithm.initial_memory(3), seen, jax.random.key(0), Channel())
+    total = np.zeros((3, 5))
+    for symmetry in range(8):
+        numbers = learner.target.agent(env.turn(seen, jnp.asarray(symmetry)))[0].head
+        for action in range(5):
+            total[:, action] += numbers[:, env.turn_action(jnp.asarray(action), jnp.asarray(symmetry))]
+    np.testing.assert_array_equal(decision.action, total.argmax(1))
+    np.testing.assert_array_equal(decision.message, learner.target.agent(seen)[0].message)
+
+
+def test_a_network_with_a_memory_is_refused():
+    with pytest.raises(ConfigError, match="symmetric_play needs a network without memory"):
+        replace(
+            configuration.preset("gacrl").algorithm, symmetric_play=True, network=NetworkConfig(recurrent=True)
+        )
