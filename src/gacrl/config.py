@@ -87,19 +87,37 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class CurriculumConfig:
-    """How the task changes while training: linearly over episodes, from its value in env to the value here."""
+    """How the task grows harder while training: linearly over episodes. It is always evaluated as `env` has it."""
 
     local_ratio_end: float | None = None
     """Local ratio after the last episode; none: constant."""
     coverage_threshold_end: float | None = None
     """θ after the last episode; none: constant."""
+    arena_scale_start: float | None = None
+    """Arena of the first episode, from which it changes to env's; none: constant."""
+    num_agents_start: int | None = None
+    """Agents of the first episode; more join, and landmarks in proportion, until all of env's are there."""
     episodes: int = 1500
     """Episodes that the change takes."""
+    gate: float | None = None
+    """Only episodes count at whose end this share of the landmarks is covered within θ, in a running mean over
+    episodes; none: all count."""
 
     def __post_init__(self) -> None:
-        between("curriculum", self, 0.0, 1.0, "local_ratio_end")
-        between("curriculum", self, 0.001, 1000.0, "coverage_threshold_end")
+        between("curriculum", self, 0.0, 1.0, "local_ratio_end", "gate")
+        between("curriculum", self, 0.001, 1000.0, "coverage_threshold_end", "arena_scale_start")
+        between("curriculum", self, 1, 10_000, "num_agents_start")
         between("curriculum", self, 1, 1e9, "episodes")
+        require(
+            self.gate is None or self.changes,
+            "curriculum.gate has nothing to hold back: set one of curriculum's ends or starts, or leave it",
+        )
+
+    @property
+    def changes(self) -> bool:
+        """Something about the task moves."""
+        moving = self.local_ratio_end, self.coverage_threshold_end, self.arena_scale_start, self.num_agents_start
+        return any(value is not None for value in moving)
 
 
 @dataclass(frozen=True)
@@ -159,6 +177,15 @@ class RunConfig:
         require(
             not (self.env.continuous_actions and self.algorithm.name == GacrlPaperConfig.name),
             f"{self.algorithm.name} needs discrete actions: leave env.continuous_actions at False",
+        )
+        start = self.curriculum.num_agents_start
+        require(
+            start is None or self.algorithm.name != GacrlPaperConfig.name,
+            f"{self.algorithm.name} knows teams of one size only: leave curriculum.num_agents_start",
+        )
+        require(
+            start is None or start <= self.env.num_agents,
+            f"curriculum.num_agents_start must be at most env.num_agents, {self.env.num_agents}, not {start}",
         )
 
     @property

@@ -15,7 +15,7 @@ from gacrl import config as settings
 from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.algorithms import gacrl_paper, replay
 from gacrl.algorithms.exploration import Coverage
-from gacrl.config import CurriculumConfig, EnvConfig
+from gacrl.config import CurriculumConfig
 from gacrl.envs.spread import Spread
 from gacrl.networks.layers import num_parameters
 from gacrl.training import curriculum
@@ -619,7 +619,7 @@ def test_curriculum_moves_once_an_episode():
     """Local ratio .5 → .1 and θ .5 → .2 over 1500 episodes; steps within an episode change nothing."""
     env = Spread(N, 3, max_cycles=75, reward="paper")
     paper = settings.preset("paper")
-    advancing = curriculum.make(paper.curriculum, paper.env)
+    advancing = curriculum.make(paper.curriculum)
     base = env.default_params()
 
     def advance(state, done):
@@ -630,7 +630,8 @@ def test_curriculum_moves_once_an_episode():
     def levels(params):
         return float(params.local_ratio), float(params.coverage_threshold)
 
-    state = advancing.init(base)
+    state, params = advancing.init(base)
+    assert levels(params) == (0.5, 0.5)
     for _ in range(3):
         state, params = advance(state, [[False]])
         assert levels(params) == (0.5, 0.5)
@@ -644,8 +645,8 @@ def test_curriculum_moves_once_an_episode():
 
 
 def test_no_curriculum_leaves_the_task_alone():
-    still = curriculum.make(CurriculumConfig(), EnvConfig())
+    still = curriculum.make(CurriculumConfig())
     params = ENV.default_params()
     done = jnp.ones((1, 1), bool)
     rollout = Rollout(SimpleNamespace(terminated=done, truncated=done), (), ())
-    assert still.advance(still.init(params), jnp.int32(9), rollout)[1] is params
+    assert still.advance(still.init(params)[0], jnp.int32(9), rollout)[1] is params

@@ -4,11 +4,12 @@ N agents must stand on L landmarks without touching each other. Beyond MPE2: L â
 landmarks that move, padded agents, and the readings of the paper's "resets if agents collide".
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.environment import TimeStep
@@ -111,6 +112,13 @@ class Spread:
         return jax.tree.map(
             lambda leaf: jnp.asarray(leaf, None if jnp.asarray(leaf).dtype == bool else float),
             self.initial_params,
+        )
+
+    def padded(self) -> "Spread":
+        """The same task with room for absence: masks in its parameters, in which all are there."""
+        agents, landmarks = np.ones(self.num_agents, bool), np.ones(self.num_landmarks, bool)
+        return replace(
+            self, initial_params=self.initial_params._replace(agent_mask=agents, landmark_mask=landmarks)
         )
 
     def reset(self, key: PRNGKey, params: SpreadParams | None = None) -> tuple[SpreadState, Observation]:

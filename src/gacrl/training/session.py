@@ -70,10 +70,12 @@ class Watcher:
 def build(config: RunConfig) -> Trainer:
     """The compiled functions that train this configuration."""
     env = envs.make(config.env)
+    if config.curriculum.num_agents_start is not None:
+        env = env.padded()
     return Trainer(
         algorithm=algorithms.make(config.algorithm, env, config.training),
         env=env,
-        curriculum=curriculum.make(config.curriculum, config.env),
+        curriculum=curriculum.make(config.curriculum),
         num_envs=config.training.num_envs,
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,

@@ -102,13 +102,14 @@ class Trainer:
     @partial(jax.jit, static_argnums=0)
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
         learner_key, start_key, key = jax.random.split(key, 3)
+        curriculum, params = self.curriculum.init(params)
         carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs)
         tally = jax.vmap(lambda _: no_steps(self.measures))(jnp.arange(self.num_envs))
         return TrainState(
             learner=self.algorithm.init(learner_key, hyper),
             carry=carry,
             env_params=params,
-            curriculum=self.curriculum.init(params),
+            curriculum=curriculum,
             tally=tally,
             episodes=jnp.zeros((), jnp.int32),
             key=key,
