@@ -88,7 +88,9 @@ def test_a_team_grows_within_one_program():
         state, report = chunk(state, 4)
         assert all(np.isfinite(value).all() for value in report.metrics.values())
     assert sizes == [1, 2, 3]
-    assert trainer.evaluation_env.default_params().agent_mask is None, "evaluated with the whole team, without masks"
+    assert trainer.evaluation_env.default_params().agent_mask is None, (
+        "evaluated with the whole team, without masks"
+    )
     assert jax.tree.leaves(trainer.evaluate(state.learner, False, "monitor", 2))[0].shape == (1, 2)
 
 

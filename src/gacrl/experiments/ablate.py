@@ -69,6 +69,9 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "fixed-exploration": Part("ε and τ stay at their end", _algorithm(exploration="fixed")),
         YOKED: Part("the levels of 'all parts' replayed, mean over its seeds", _algorithm(exploration="yoked")),
         "no-symmetry": Part("what is replayed is not turned", _algorithm(augment=False)),
+        "plain-play": Part(
+            "played in the world as it is, not by the mean over its turns", _algorithm(symmetric_play=False)
+        ),
         "no-coverage-bonus": Part("MPE2's reward alone", {"env": {"reward": "mpe2"}}),
         "one-step": Part("targets of one reward", _algorithm(n_step=1)),
         "no-average": Part("played with the parameters that learn", _algorithm(averaged=False)),
