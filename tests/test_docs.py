@@ -1,0 +1,71 @@
+"""What the documents and the help texts name is there: files, commands, flags and presets."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gacrl import arguments, cli
+
+ROOT = Path(__file__).parent.parent
+PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+PLACEHOLDERS = {"RUN", "FILE", "FOLDER", "SPEC", "NAME", "COMMAND", "ADDRESS", "H", "N", "X", "K"}
+
+
+class Understood(BaseException):
+    """The command line was parsed; nothing was done yet."""
+
+
+def commands(text: str) -> list[list[str]]:
+    """Every whole `gacrl` command in backticks, or on a line of its own in a block or a help text."""
+    found = re.findall(r"`gacrl ([^`]+)`|^ *gacrl ([^#\n]+)", text, flags=re.MULTILINE)
+    lines = (re.split(r"  | > ", inline or line)[0] for inline, line in found)
+    return [words for words in map(shlex.split, lines) if words and not PLACEHOLDERS & set(words)]
+
+
+@pytest.fixture
+def only_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = arguments.parse
+
+    def stop(*given: Any, **named: Any) -> None:
+        parse(*given, **named)
+        raise Understood
+
+    monkeypatch.setattr(arguments, "parse", stop)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path):
+    for link in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+        assert "://" in link or (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+def test_every_command_of_the_documents_and_of_help_is_understood(only_parsed: None):
+    written = [
+        page for page in PAGES if page.parent.name != "reproduction"
+    ]  # the other one is printed by the program
+    texts = [page.read_text(encoding="utf-8") for page in written]
+    texts += [cli.OVERVIEW, *(kind.__doc__ or "" for kind in vars(arguments).values() if isinstance(kind, type))]
+    said = [words for text in texts for words in commands(text) if "--config" not in words]
+    assert {words[0] for words in said} >= set(cli._COMMANDS), "every command has an example"
+    for words in said:
+        if words[0] in cli._COMMANDS and len(words) > 1 and "--help" not in words:
+            with pytest.raises(Understood):
+                assert cli.main(words) == 0, f"gacrl {' '.join(words)}"
+
+
+def test_every_setting_that_the_documents_name_exists():
+    """Whole names: what stands as `.rounds` after one of them is not followed."""
+    from gacrl import config
+
+    def names(data: dict[str, Any], where: str = "") -> set[str]:
+        inner = [names(value, f"{where}{key}.") for key, value in data.items() if isinstance(value, dict)]
+        return {where + key for key in data}.union(*inner)
+
+    known = set().union(*(names(config.to_dict(config.preset(name))) for name in config.PRESETS))
+    pattern = r"`((?:algorithm|env|training|evaluation|curriculum)\.[a-z_.]+?)(?: [^`]*)?`"
+    for page in PAGES:
+        unknown = set(re.findall(pattern, page.read_text(encoding="utf-8"))) - known
+        assert not {name for name in unknown if not name.startswith("training.devices")}, page.name
