@@ -20,25 +20,15 @@ import sys
 import time
 from pathlib import Path
 
+import peers
+
 HERE = Path(__file__).parent
-PEER = HERE.parent / ".bench" / "torch"
 STEPS, WARMUP = 3_000, 300
 
 
-def peer_python() -> str:
-    """The interpreter of the peer's environment, made if need be."""
-    python = PEER / "bin" / "python"
-    if not python.exists():
-        print(f"making {PEER} for PyTorch", flush=True)
-        subprocess.run([sys.executable, "-m", "venv", str(PEER)], check=True)
-        install = [str(python), "-m", "pip", "install", "--quiet", "torch==2.13.0", "mpe2", "numpy"]
-        subprocess.run(install, check=True)
-    return str(python)
-
-
-def run_peer(core: int, fused: bool) -> float:
+def run_peer(python: str, core: int, fused: bool) -> float:
     """Steps per second of the plain program."""
-    command = [peer_python(), str(HERE / "plain_torch.py"), "--steps", "1500", "--warmup", str(WARMUP), "--json"]
+    command = [python, str(HERE / "plain_torch.py"), "--steps", "1500", "--warmup", str(WARMUP), "--json"]
     command += ["--core", str(core)] + ["--fused"] * fused
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])["steps_per_second"]
@@ -114,16 +104,19 @@ def main() -> None:
     if arguments.ours:
         measure_ours(arguments.core)
         return
-    peers = {"mpe2 + PyTorch": False, "mpe2 + PyTorch, fused Adam": True}
-    ratios: dict[str, list[float]] = {name: [] for name in peers}
+    python = peers.python_of("torch")
+    if python is None:
+        return
+    programs = {"mpe2 + PyTorch": False, "mpe2 + PyTorch, fused Adam": True}
+    ratios: dict[str, list[float]] = {name: [] for name in programs}
     shares = []
     for turn in range(arguments.rounds):
         ours = run_ours(arguments.core)
         milliseconds = 1e3 / ours["steps_per_second"]
         shares.append(flops_per_step() / ours["gflops"] / 1e6 / milliseconds)
         print(f"round {turn + 1}: ours {ours['steps_per_second']:.0f} steps/s ({milliseconds:.2f} ms)", end="")
-        for name, fused in peers.items():
-            rate = run_peer(arguments.core, fused)
+        for name, fused in programs.items():
+            rate = run_peer(python, arguments.core, fused)
             ratios[name].append(ours["steps_per_second"] / rate)
             print(f", {name} {rate:.0f} ({ratios[name][-1]:.1f} times)", end="", flush=True)
         print(flush=True)

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Bool
 
+from gacrl.envs import copies
 from gacrl.envs.environment import Environment, EnvParams, EnvState
 from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Rollout, Transition
 
@@ -22,7 +23,7 @@ class Carry(NamedTuple):
 
 def start(env: Environment, params: EnvParams, memory: Memory, key: PRNGKey, num_envs: int) -> Carry:
     """E fresh episodes. memory: the policy's initial memory for one environment."""
-    env_state, observation = jax.vmap(env.reset, (0, None))(jax.random.split(key, num_envs), params)
+    env_state, observation = copies.reset(env, params, jax.random.split(key, num_envs))
     memories = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), memory)
     return Carry(env_state, observation, memories, jnp.ones(num_envs, bool))
 
@@ -39,27 +40,26 @@ def step(
     """Every environment takes one step; those whose episode ended are reset, with fresh memory."""
     channel = Channel() if channel is None else channel
 
-    def one(carry: Carry, keys: Key[Array, " 3"]) -> tuple[Carry, Transition]:
-        act_key, env_key, reset_key = keys
-        decision, memory = policy(carry.memory, carry.observation, act_key, channel)
-        env_state, after = env.step(carry.env_state, decision.action, env_key, params)
-        done = after.terminated | after.truncated
-        transition = Transition(
-            observation=carry.observation,
-            decision=decision,
-            reward=after.reward,
-            terminated=after.terminated,
-            truncated=after.truncated,
-            first=carry.first,
-            next_observation=after.observation,
-            info=after.info,
-        )
-        fresh = (*env.reset(reset_key, params), initial_memory)
-        going_on = (env_state, after.observation, memory)
-        env_state, observation, memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, going_on)
-        return Carry(env_state, observation, memory, done), transition
-
-    return jax.vmap(one)(carry, jax.random.split(key, (carry.first.shape[0], 3)))
+    keys = jax.random.split(key, (carry.first.shape[0], 3))
+    decision, memory = jax.vmap(policy, (0, 0, 0, None))(carry.memory, carry.observation, keys[:, 0], channel)
+    step_mapped = jax.vmap(env.step, (0, 0, 0, None))  # and not `step_many`: docs/design.md
+    env_state, after = step_mapped(carry.env_state, decision.action, keys[:, 1], params)
+    transition = Transition(
+        observation=carry.observation,
+        decision=decision,
+        reward=after.reward,
+        terminated=after.terminated,
+        truncated=after.truncated,
+        first=carry.first,
+        next_observation=after.observation,
+        info=after.info,
+    )
+    env_state, observation = copies.begin_anew(env, params, env_state, after, lambda: keys[:, 2])
+    done = after.terminated | after.truncated
+    keep = jax.vmap(
+        lambda done, old: jax.tree.map(lambda new, old: jnp.where(done, new, old), initial_memory, old)
+    )
+    return Carry(env_state, observation, keep(done, memory), done), transition
 
 
 def collect(

@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl.types import Entities, Metrics, Observation, PRNGKey
 
@@ -53,6 +53,19 @@ class Environment(Protocol):
     def step(
         self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams | None = None
     ) -> tuple[EnvState, TimeStep]: ...
+
+
+@runtime_checkable
+class BatchEnvironment(Environment, Protocol):
+    """A task that knows a quicker way to step many copies than mapping its step."""
+
+    def step_many(
+        self, state: EnvState, action: Array, keys: Key[Array, " E"], params: EnvParams | None = None
+    ) -> tuple[EnvState, TimeStep]: ...
+
+    def observe_many(self, state: EnvState, params: EnvParams | None = None) -> Observation:
+        """What is seen in each copy's state."""
+        ...
 
 
 @runtime_checkable

@@ -1,7 +1,13 @@
-"""The particle world of MPE: damped point masses that push each other apart on contact."""
+"""The particle world of MPE: damped point masses that push each other apart on contact.
 
+Written for one world. Where arrays have further axes at their end (`*e`) they are as many worlds at once: a
+processor's vector units then run over worlds, where a single one has only pairs of coordinates to offer them.
+"""
+
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -27,54 +33,65 @@ class Physics(NamedTuple):
         return self.action_force * self.time_step / self.damping
 
 
+def along(values: Array, like: Array) -> Array:
+    """Numbers that all worlds share, with an axis of one for each axis that an array of worlds has at its end."""
+    return values.reshape(values.shape + (1,) * (like.ndim - values.ndim))
+
+
 def pairwise_offsets(
-    positions: Float[Array, "N 2"], others: Float[Array, "M 2"]
-) -> tuple[Float[Array, "N M 2"], Float[Array, "N M"]]:
+    positions: Float[Array, "N 2 *e"], others: Float[Array, "M 2 *e"]
+) -> tuple[Float[Array, "N M 2 *e"], Float[Array, "N M *e"]]:
     """From each position to each of the others: offset `others - position`, and its length."""
-    offsets = others[None, :, :] - positions[:, None, :]
-    return offsets, jnp.sqrt(jnp.square(offsets).sum(-1))
+    offsets = others[None] - positions[:, None]
+    return offsets, jnp.sqrt(jnp.square(offsets).sum(2))
+
+
+def between_agents(
+    positions: Float[Array, "N 2 *e"], agent_mask: Bool[Array, " N"] | None
+) -> tuple[Float[Array, "N N 2 *e"], Float[Array, "N N *e"], Bool[Array, "N N *#e"]]:
+    """From each agent to each agent: offset, distance, and whether the two are real and not one."""
+    offsets, distance = pairwise_offsets(positions, positions)
+    pairs = ~jnp.eye(positions.shape[0], dtype=bool)
+    if agent_mask is not None:
+        pairs &= agent_mask[:, None] & agent_mask[None, :]
+    return offsets, distance, along(pairs, distance)
 
 
 def contact_forces(
-    positions: Float[Array, "N 2"], agent_mask: Bool[Array, " N"] | None, physics: Physics
-) -> Float[Array, "N 2"]:
+    positions: Float[Array, "N 2 *e"], agent_mask: Bool[Array, " N"] | None, physics: Physics
+) -> Float[Array, "N 2 *e"]:
     """The force on each agent from its contacts with the others (a softplus of the penetration).
 
     Two agents at the very same point have no direction to be pushed in: the force there is 0, where MPE2
     divides by zero and gives NaN.
     """
-    num_agents = positions.shape[0]
-    offsets, distance = pairwise_offsets(positions, positions)
+    offsets, distance, pairs = between_agents(positions, agent_mask)
     margin = physics.contact_margin
     penetration = margin * jnp.logaddexp(0.0, (2 * physics.agent_radius - distance) / margin)
-    touching = distance > 0
-    strength = physics.contact_force * penetration / jnp.where(touching, distance, 1.0)
-    between = ~jnp.eye(num_agents, dtype=bool) & touching
-    if agent_mask is not None:
-        between &= agent_mask[:, None] & agent_mask[None, :]
-    return -(jnp.where(between, strength, 0.0)[..., None] * offsets).sum(1)
+    apart = distance > 0
+    strength = physics.contact_force * penetration / jnp.where(apart, distance, 1.0)
+    return -(jnp.where(pairs & apart, strength, 0.0)[:, :, None] * offsets).sum(1)
 
 
-def action_forces(action: Array, physics: Physics, continuous: bool) -> Float[Array, "N 2"]:
+def action_forces(action: Array, physics: Physics, continuous: bool) -> Float[Array, "N 2 *e"]:
     """The force of each agent's own action.
 
-    Discrete: indices [N] into `DIRECTIONS`. Continuous: [N, 5] in [0, 1], clipped there as MPE2's wrapper
+    Discrete: indices [N, *e] into `DIRECTIONS`. Continuous: [N, 5, *e] in [0, 1], clipped there as MPE2's wrapper
     does; the force is right minus left, up minus down.
     """
-    if continuous:
-        pushes = jnp.clip(action, 0.0, 1.0)
-        unit = jnp.stack([pushes[:, RIGHT] - pushes[:, LEFT], pushes[:, UP] - pushes[:, DOWN]], axis=-1)
-    else:
-        unit = jnp.asarray(DIRECTIONS)[action]
+    # The one-hot, by comparisons, because a look-up is not vectorised.
+    one_hot = partial(jax.nn.one_hot, num_classes=len(DIRECTIONS), dtype=float, axis=1)
+    pushes = jnp.clip(action, 0.0, 1.0) if continuous else one_hot(action)
+    unit = jnp.stack([pushes[:, RIGHT] - pushes[:, LEFT], pushes[:, UP] - pushes[:, DOWN]], axis=1)
     return physics.action_force * unit
 
 
 def integrate(
-    positions: Float[Array, "N 2"],
-    velocities: Float[Array, "N 2"],
-    forces: Float[Array, "N 2"],
+    positions: Float[Array, "N 2 *e"],
+    velocities: Float[Array, "N 2 *e"],
+    forces: Float[Array, "N 2 *e"],
     physics: Physics,
-) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"]]:
+) -> tuple[Float[Array, "N 2 *e"], Float[Array, "N 2 *e"]]:
     """One step: positions move with the old velocity, then velocities are damped and pushed (mass 1)."""
     moved = positions + velocities * physics.time_step
     return moved, velocities * (1 - physics.damping) + forces * physics.time_step

@@ -5,18 +5,20 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from gacrl.envs.particles import along
+
 CollisionTerm = Literal["per_agent", "once"]
 
 
 def paper_shaped_reward(
-    raw: Float[Array, ""],
-    landmark_distance: Float[Array, " N"],
-    agent_distance: Float[Array, " N"],
+    raw: Float[Array, "*e"],
+    landmark_distance: Float[Array, "N *e"],
+    agent_distance: Float[Array, "N *e"],
     threshold: Float[Array, ""] | float,
     collision_distance: Float[Array, ""] | float = 0.2,
     collision_term: CollisionTerm = "per_agent",
     agent_mask: Bool[Array, " N"] | None = None,
-) -> Float[Array, ""]:
+) -> Float[Array, "*e"]:
     """Equation (1): the team's reward of one step.
 
     raw: r_raw, the mean over agents of MPE2's reward. landmark_distance: d_min,i, from each agent to its
@@ -31,7 +33,8 @@ def paper_shaped_reward(
     colliding = agent_distance < collision_distance
     bonus = proximity + coverage
     if agent_mask is not None:
-        bonus = jnp.where(agent_mask, bonus, 0.0)
-        colliding &= agent_mask
-    penalty = colliding.sum() if collision_term == "per_agent" else colliding.any()
-    return raw + bonus.sum() - penalty
+        real = along(agent_mask, bonus)
+        bonus = jnp.where(real, bonus, 0.0)
+        colliding &= real
+    penalty = colliding.sum(0) if collision_term == "per_agent" else colliding.any(0)
+    return raw + bonus.sum(0) - penalty

@@ -2,28 +2,32 @@
 
 N agents must stand on L landmarks without touching each other. Beyond MPE2: L ≠ N, an arena of any size,
 landmarks that move, padded agents, and the readings of the paper's "resets if agents collide".
+
+As in `particles`, arrays may have axes of copies at their end; `Spread.step_many` steps many copies so.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from gacrl.envs.environment import TimeStep
 from gacrl.envs.particles import (
     DIRECTIONS,
     Physics,
     action_forces,
+    along,
+    between_agents,
     contact_forces,
     integrate,
     pairwise_offsets,
 )
 from gacrl.envs.shaping import CollisionTerm, paper_shaped_reward
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
-from gacrl.types import Entities, Metrics, Observation, PRNGKey
+from gacrl.types import Entities, Observation, PRNGKey
 
 CAPTURE_RADIUS = 0.1
 """MPE2's radius of a covered landmark."""
@@ -127,43 +131,56 @@ class Spread:
         state = self._place(key, params)
         return state, self.observe(state, params)
 
+    def step_many(
+        self, state: SpreadState, action: Array, keys: Key[Array, " E"], params: SpreadParams | None = None
+    ) -> tuple[SpreadState, TimeStep]:
+        """What `step` is for each of E copies [E, …], to rounding; several times as fast as mapping it."""
+        last_state, last_action = _copies_last((state, action))
+        return _copies_first(self.step(last_state, last_action, keys, params))
+
+    def observe_many(self, state: SpreadState, params: SpreadParams | None = None) -> Observation:
+        """What `observe` is for each of E copies [E, …]."""
+        params = self.default_params() if params is None else params
+        return _copies_first(self.observe(_copies_last(state), params))
+
     def step(
-        self, state: SpreadState, action: Array, key: PRNGKey, params: SpreadParams | None = None
+        self, state: SpreadState, action: Array, key: Key[Array, "*e"], params: SpreadParams | None = None
     ) -> tuple[SpreadState, TimeStep]:
         """One step of the world. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
         params = self.default_params() if params is None else params
         state = self._move(state, action, params)
         info = self.measure(state, params)
         if self.reward == "paper":
-            reward = jnp.broadcast_to(info["reward_shaped"], (self.num_agents,))
+            reward = jnp.broadcast_to(info["reward_shaped"], (self.num_agents, *state.clock.shape))
         else:
             reward = self.rewards(state, params)
         if self.reward == "coverage":
-            reward += params.coverage_bonus * info[f"coverage_{CAPTURE_RADIUS}"]
-        if params.agent_mask is not None:
-            reward = jnp.where(params.agent_mask, reward, 0.0)
+            reward += params.coverage_bonus * info[f"coverage_{CAPTURE_RADIUS}"][None]
+        reward = _masked(reward, params.agent_mask)
 
         truncated = state.clock >= self.max_cycles
-        terminated = jnp.zeros((), bool)
+        terminated = jnp.zeros_like(truncated)
         if self.terminate_on_success:
             # MPE2 looks at the time limit first: success at the last step is a truncation there.
             terminated = (info[f"success_{CAPTURE_RADIUS}"] == 1.0) & ~truncated
         if self.reset_on_collision != "off":
             distance = _nearest_agent(state.positions, params.agent_mask)
-            collided = (distance < params.reset_distance).any()
+            collided = (distance < params.reset_distance).any(0)
             if self.reset_on_collision == "truncate":
                 truncated |= collided
             else:
                 fresh = self._place(key, params)._replace(clock=state.clock)
-                state = jax.tree.map(lambda new, old: jnp.where(collided, new, old), fresh, state)
+                state = jax.tree.map(
+                    lambda new, old: jnp.where(jnp.broadcast_to(collided, old.shape), new, old), fresh, state
+                )
         return state, TimeStep(self.observe(state, params), reward, terminated, truncated, info)
 
-    def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, " N"]:
+    def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, "N *e"]:
         """MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
         _, to_landmarks = pairwise_offsets(state.positions, state.landmarks)
-        shared = -_masked(_over_agents(to_landmarks, params), params.landmark_mask).sum()
+        shared = -_masked(_over_agents(to_landmarks, params), params.landmark_mask).sum(0)
         own = -params.collision_penalty * _touching(state.positions, params).sum(1)
-        return own * params.local_ratio + shared * (1 - params.local_ratio)
+        return own * params.local_ratio + shared[None] * (1 - params.local_ratio)
 
     def observe(self, state: SpreadState, params: SpreadParams) -> Observation:
         """What each agent sees, in MPE2's order, and the exact state for central critics and oracles.
@@ -171,45 +188,34 @@ class Spread:
         Whatever stands in the place of padding is 0.
         """
         offsets, distance = pairwise_offsets(state.positions, state.landmarks)
-        landmarks = _nearest(offsets, distance, params.landmark_mask, self.num_landmark_neighbors)
+        there = None if params.landmark_mask is None else params.landmark_mask[None, :]
+        landmarks = _nearest(offsets, distance, there, self.num_landmark_neighbors)
 
-        others = _others(self.num_agents)
-        offsets, distance = pairwise_offsets(state.positions, state.positions)
-        offsets = jnp.take_along_axis(offsets, others[..., None], axis=1)
-        distance = jnp.take_along_axis(distance, others, axis=1)
-        mask = None if params.agent_mask is None else params.agent_mask[others]
-        agents = _nearest(offsets, distance, mask, self.num_agent_neighbors)
+        offsets, distance, pairs = between_agents(state.positions, params.agent_mask)
+        there = None if params.agent_mask is None else _without_self(pairs)
+        agents = _nearest(_without_self(offsets), _without_self(distance), there, self.num_agent_neighbors)
 
-        flat = (self.num_agents, -1)
-        silence = jnp.zeros((self.num_agents, 2 * self.seen_agents), state.positions.dtype)
+        copies = state.clock.shape
+        flat = (self.num_agents, -1, *copies)
+        silence = jnp.zeros((self.num_agents, 2 * self.seen_agents, *copies), state.positions.dtype)
         features = jnp.concatenate(
             [state.velocities, state.positions, landmarks.reshape(flat), agents.reshape(flat), silence],
             axis=1,
         )
         agent_mask, landmark_mask = params.agent_mask, params.landmark_mask
-        if agent_mask is None:
-            agent_mask = jnp.ones(self.num_agents, bool)
-        else:
-            real = agent_mask[:, None]
-            features = jnp.where(real, features, 0.0)
-            state = state._replace(
-                positions=jnp.where(real, state.positions, 0.0),
-                velocities=jnp.where(real, state.velocities, 0.0),
-            )
-        if landmark_mask is None:
-            landmark_mask = jnp.ones(self.num_landmarks, bool)
-        else:
-            real = landmark_mask[:, None]
-            state = state._replace(
-                landmarks=jnp.where(real, state.landmarks, 0.0),
-                landmark_velocities=jnp.where(real, state.landmark_velocities, 0.0),
-            )
+        state = SpreadState(
+            positions=_masked(state.positions, agent_mask),
+            velocities=_masked(state.velocities, agent_mask),
+            landmarks=_masked(state.landmarks, landmark_mask),
+            landmark_velocities=_masked(state.landmark_velocities, landmark_mask),
+            clock=state.clock,
+        )
         return Observation(
-            features=features,
+            features=_masked(features, agent_mask),
             positions=state.positions,
-            agent_mask=agent_mask,
-            landmark_mask=landmark_mask,
-            action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
+            agent_mask=_everywhere(agent_mask, (self.num_agents, *copies)),
+            landmark_mask=_everywhere(landmark_mask, (self.num_landmarks, *copies)),
+            action_mask=jnp.ones((self.num_agents, self.num_actions, *copies), bool),
             state=pack_state(state),
         )
 
@@ -257,7 +263,7 @@ class Spread:
         """The action that does in the turned world what this one does here."""
         return turn_action(action, symmetry, self.continuous_actions)
 
-    def measure(self, state: SpreadState, params: SpreadParams) -> Metrics:
+    def measure(self, state: SpreadState, params: SpreadParams) -> dict[str, Float[Array, "*e"]]:
         """The measurements of one step; `gacrl.evaluation.metrics` turns them into an episode's.
 
         Distances in arena units; coverages are fractions of the landmarks that have an agent within the
@@ -269,10 +275,10 @@ class Spread:
         hidden = None if params.landmark_mask is None else params.landmark_mask[None, :]
         own_distance = jnp.min(_masked(to_landmarks, hidden, jnp.inf), axis=1)
         neighbour_distance = _nearest_agent(state.positions, params.agent_mask)
-        touching = _touching(state.positions, params).sum()
+        touching = _touching(state.positions, params).sum((0, 1))
 
         agents, landmarks = params.agent_mask, params.landmark_mask
-        shared = -_masked(landmark_distance, landmarks).sum()
+        shared = -_masked(landmark_distance, landmarks).sum(0)
         own = -touching / _count(agents, self.num_agents)
         learner_raw = params.collision_penalty * own * params.local_ratio + shared * (1 - params.local_ratio)
 
@@ -298,18 +304,25 @@ class Spread:
             "near_agents": _mean(neighbour_distance < NEAR_DISTANCE, agents),
         }
 
-    def _place(self, key: PRNGKey, params: SpreadParams) -> SpreadState:
-        entities = self.num_agents + self.num_landmarks
-        draws = jax.random.uniform(key, (2 * entities + self.num_landmarks,), dtype=float, minval=-1.0, maxval=1.0)
-        places = draws[: 2 * entities].reshape(entities, 2) * params.arena_scale
+    def _place(self, key: Key[Array, "*e"], params: SpreadParams) -> SpreadState:
+        entities, copies = self.num_agents + self.num_landmarks, key.shape
+
+        def draw(key: Key[Array, "*e"]) -> Float[Array, "K *e"]:
+            if key.ndim:
+                return jax.vmap(draw, out_axes=-1)(key)
+            size = 2 * entities + self.num_landmarks
+            return jax.random.uniform(key, (size,), dtype=float, minval=-1.0, maxval=1.0)
+
+        draws = draw(key)
+        places = draws[: 2 * entities].reshape(entities, 2, *copies) * params.arena_scale
         heading = jnp.pi * draws[2 * entities :]
         speed = params.landmark_speed * params.physics.top_speed
         return SpreadState(
             positions=places[: self.num_agents],
-            velocities=jnp.zeros((self.num_agents, 2), places.dtype),
+            velocities=jnp.zeros((self.num_agents, 2, *copies), places.dtype),
             landmarks=places[self.num_agents :],
-            landmark_velocities=speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
-            clock=jnp.zeros((), jnp.int32),
+            landmark_velocities=speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1),
+            clock=jnp.zeros(copies, jnp.int32),
         )
 
     def _move(self, state: SpreadState, action: Array, params: SpreadParams) -> SpreadState:
@@ -325,17 +338,17 @@ class Spread:
 
 
 def reflect(
-    positions: Float[Array, "L 2"], velocities: Float[Array, "L 2"], limit: Float[Array, ""] | float
-) -> tuple[Float[Array, "L 2"], Float[Array, "L 2"]]:
+    positions: Float[Array, "L 2 *e"], velocities: Float[Array, "L 2 *e"], limit: Float[Array, ""] | float
+) -> tuple[Float[Array, "L 2 *e"], Float[Array, "L 2 *e"]]:
     """Mirror what has left [−limit, limit]² back inside, once, and turn its velocity around."""
     bounced = jnp.where(positions > limit, 2 * limit - positions, positions)
     bounced = jnp.where(positions < -limit, -2 * limit - positions, bounced)
     return bounced, jnp.where(jnp.abs(positions) > limit, -velocities, velocities)
 
 
-def pack_state(state: SpreadState) -> Float[Array, " S"]:
+def pack_state(state: SpreadState) -> Float[Array, "S *e"]:
     """The global state as one vector: S = 4 N + 4 L."""
-    return jnp.concatenate([part.reshape(-1) for part in state[:4]])
+    return jnp.concatenate([part.reshape(-1, *state.clock.shape) for part in state[:4]])
 
 
 def unpack_state(packed: Float[Array, " S"], num_agents: int) -> SpreadState:
@@ -346,77 +359,86 @@ def unpack_state(packed: Float[Array, " S"], num_agents: int) -> SpreadState:
     return SpreadState(positions, velocities, places, headings, jnp.zeros((), jnp.int32))
 
 
-def _others(num_agents: int) -> Int[Array, "N N-1"]:
-    """Row i: every index but i, ascending."""
-    column = jnp.arange(num_agents - 1)[None, :]
-    return column + (column >= jnp.arange(num_agents)[:, None])
+def _copies_last(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), tree)
+
+
+def _copies_first(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), tree)
+
+
+def _without_self(pairs: Shaped[Array, "N N *r"]) -> Shaped[Array, "N N-1 *r"]:
+    """Row i without its entry i. (By slices: in one long row, the diagonal is every N + 1st entry.)"""
+    size, rest = pairs.shape[0], pairs.shape[2:]
+    after_first = pairs.reshape(size * size, *rest)[1:]
+    rows = after_first.reshape(size - 1, size + 1, *rest)[:, :-1]
+    return rows.reshape(size, size - 1, *rest)
 
 
 def _nearest(
-    offsets: Float[Array, "N M 2"],
-    distance: Float[Array, "N M"],
-    mask: Bool[Array, "#N M"] | Bool[Array, " M"] | None,
+    offsets: Float[Array, "N M 2 *e"],
+    distance: Float[Array, "N M *e"],
+    there: Bool[Array, "#N M *#e"] | None,
     count: int | None,
-) -> Float[Array, "N K 2"]:
+) -> Float[Array, "N K 2 *e"]:
     """The offsets of the `count` nearest, nearest first and zero-padded; of all in order where it is None."""
-    if mask is not None:
-        mask = jnp.broadcast_to(mask, distance.shape)
-        offsets = jnp.where(mask[..., None], offsets, 0.0)
-        distance = jnp.where(mask, distance, jnp.inf)
+    if there is not None:
+        there = jnp.broadcast_to(along(there, distance), distance.shape)
+        offsets = jnp.where(there[:, :, None], offsets, 0.0)
+        distance = jnp.where(there, distance, jnp.inf)
     if count is None:
         return offsets
-    nearest = jnp.argsort(distance, axis=1)[:, :count]
-    chosen = jnp.take_along_axis(offsets, nearest[..., None], axis=1)
-    return jnp.pad(chosen, ((0, 0), (0, count - chosen.shape[1]), (0, 0)))
+    count_there = min(count, distance.shape[1])
+    _, nearest = jax.lax.top_k(-jnp.moveaxis(distance, 1, -1), count_there)  # far from a full sort
+    chosen = jnp.take_along_axis(offsets, jnp.moveaxis(nearest, -1, 1)[:, :, None], axis=1)
+    return jnp.pad(chosen, ((0, 0), (0, count - chosen.shape[1]), *[(0, 0)] * (chosen.ndim - 2)))
 
 
-def _over_agents(to_landmarks: Float[Array, "N L"], params: SpreadParams) -> Float[Array, " L"]:
+def _over_agents(to_landmarks: Float[Array, "N L *e"], params: SpreadParams) -> Float[Array, "L *e"]:
     """Each landmark's distance to its nearest agent."""
-    mask = None if params.agent_mask is None else params.agent_mask[:, None]
-    return jnp.min(_masked(to_landmarks, mask, jnp.inf), axis=0)
+    return jnp.min(_masked(to_landmarks, params.agent_mask, jnp.inf), axis=0)
 
 
-def _between_agents(
-    positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None
-) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
-    """Distances between agents, and which entries are pairs of two real ones."""
-    _, distance = pairwise_offsets(positions, positions)
-    pairs = ~jnp.eye(positions.shape[0], dtype=bool)
-    if mask is not None:
-        pairs &= mask[:, None] & mask[None, :]
-    return distance, pairs
-
-
-def _touching(positions: Float[Array, "N 2"], params: SpreadParams) -> Bool[Array, "N N"]:
-    distance, pairs = _between_agents(positions, params.agent_mask)
+def _touching(positions: Float[Array, "N 2 *e"], params: SpreadParams) -> Bool[Array, "N N *e"]:
+    _, distance, pairs = between_agents(positions, params.agent_mask)
     return (distance < 2 * params.physics.agent_radius) & pairs
 
 
-def _nearest_agent(positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None) -> Float[Array, " N"]:
+def _nearest_agent(positions: Float[Array, "N 2 *e"], mask: Bool[Array, " N"] | None) -> Float[Array, "N *e"]:
     """Each agent's distance to its nearest neighbour; infinity where it has none."""
-    distance, pairs = _between_agents(positions, mask)
+    _, distance, pairs = between_agents(positions, mask)
     return jnp.min(jnp.where(pairs, distance, jnp.inf), axis=1)
 
 
-def _mean_pair_distance(positions: Float[Array, "N 2"], mask: Bool[Array, " N"] | None) -> Float[Array, ""]:
+def _mean_pair_distance(positions: Float[Array, "N 2 *e"], mask: Bool[Array, " N"] | None) -> Float[Array, "*e"]:
     """Mean distance between two agents; 0 for one agent alone."""
-    distance, pairs = _between_agents(positions, mask)
-    return jnp.where(pairs, distance, 0.0).sum() / jnp.maximum(pairs.sum(), 1)
+    _, distance, pairs = between_agents(positions, mask)
+    return jnp.where(pairs, distance, 0.0).sum((0, 1)) / jnp.maximum(pairs.sum(), 1)
 
 
 def _masked(values: Array, mask: Array | None, fill: float = 0.0) -> Array:
-    return values if mask is None else jnp.where(mask, values, fill)
+    """Values [M, …] where the mask [M] is true."""
+    return values if mask is None else jnp.where(along(mask, values), values, fill)
+
+
+def _everywhere(mask: Bool[Array, " M"] | None, shape: tuple[int, ...]) -> Bool[Array, "M *e"]:
+    """The mask for each copy; None is all true."""
+    return (
+        jnp.ones(shape, bool)
+        if mask is None
+        else jnp.broadcast_to(mask.reshape(-1, *[1] * (len(shape) - 1)), shape)
+    )
 
 
 def _count(mask: Bool[Array, " M"] | None, size: int) -> Array | int:
     return size if mask is None else mask.sum()
 
 
-def _mean(values: Array, mask: Bool[Array, " M"] | None) -> Float[Array, ""]:
+def _mean(values: Array, mask: Bool[Array, " M"] | None) -> Float[Array, "*e"]:
     """Mean over the real entries."""
-    return _masked(values * 1.0, mask).sum() / _count(mask, values.shape[0])
+    return _masked(values * 1.0, mask).sum(0) / _count(mask, values.shape[0])
 
 
-def _all(values: Bool[Array, " M"], mask: Bool[Array, " M"] | None) -> Float[Array, ""]:
-    real = values if mask is None else values | ~mask
-    return real.all() * 1.0
+def _all(values: Bool[Array, "M *e"], mask: Bool[Array, " M"] | None) -> Float[Array, "*e"]:
+    real = values if mask is None else values | ~along(mask, values)
+    return real.all(0) * 1.0
