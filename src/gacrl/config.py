@@ -57,9 +57,10 @@ class EnvConfig:
     """Speed of the landmarks, as a share of an agent's top speed."""
     coverage_threshold: float = 0.5
     """θ of the paper: its coverage bonus, and the coverage that exploration follows."""
-    reward: Literal["mpe2", "paper", "coverage"] = "mpe2"
-    """What the learner earns: MPE2's reward, the paper's shaped one (equation 1), or MPE2's and a bonus for every
-    step in which a landmark is covered within 0.1. Metrics are always of MPE2's."""
+    reward: Literal["mpe2", "paper", "coverage", "potential"] = "mpe2"
+    """What the learner earns: MPE2's reward, the paper's shaped one (equation 1), MPE2's and a bonus for every step in
+    which a landmark is covered within 0.1, or MPE2's and the change of a potential, the distance left to walk in the
+    best assignment, which leaves the optimal policy as it is. Metrics are always of MPE2's."""
     coverage_bonus: float = 1.0
     """Of reward coverage: what a step with every landmark covered adds."""
     collision_term: Literal["per_agent", "once"] = "per_agent"

@@ -25,6 +25,7 @@ from gacrl.envs.particles import (
     integrate,
     pairwise_offsets,
 )
+from gacrl.envs.potential import assignment_potential, potential_difference
 from gacrl.envs.shaping import CollisionTerm, paper_shaped_reward
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
 from gacrl.types import Entities, Observation, PRNGKey
@@ -37,7 +38,7 @@ NEAR_DISTANCE = 0.2
 REPORTED_LOCAL_RATIO = 0.5
 """`reward_raw` is always taken at MPE2's default, whatever the learner is trained on."""
 
-RewardKind = Literal["mpe2", "paper", "coverage"]
+RewardKind = Literal["mpe2", "paper", "coverage", "potential"]
 CollisionReset = Literal["off", "truncate", "in_place"]
 
 
@@ -53,6 +54,8 @@ class SpreadParams(NamedTuple):
     """θ of equation (1), of adaptive exploration and of the metric `coverage_theta`."""
     coverage_bonus: Float[Array, ""] | float = 1.0
     """Of the reward `coverage`: what a step with every landmark covered adds."""
+    potential_discount: Float[Array, ""] | float | None = None
+    """γ of the reward `potential`; None: 1."""
     arena_scale: Float[Array, ""] | float = 1.0
     """Agents and landmarks start uniformly in [−arena_scale, arena_scale]²."""
     landmark_speed: Float[Array, ""] | float = 0.0
@@ -148,6 +151,7 @@ class Spread:
     ) -> tuple[SpreadState, TimeStep]:
         """One step of the world. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
         params = self.default_params() if params is None else params
+        before = state
         state = self._move(state, action, params)
         info = self.measure(state, params)
         if self.reward == "paper":
@@ -156,8 +160,6 @@ class Spread:
             reward = self.rewards(state, params)
         if self.reward == "coverage":
             reward += params.coverage_bonus * info[f"coverage_{CAPTURE_RADIUS}"][None]
-        reward = _masked(reward, params.agent_mask)
-
         truncated = state.clock >= self.max_cycles
         terminated = jnp.zeros_like(truncated)
         if self.terminate_on_success:
@@ -173,7 +175,20 @@ class Spread:
                 state = jax.tree.map(
                     lambda new, old: jnp.where(jnp.broadcast_to(collided, old.shape), new, old), fresh, state
                 )
+        if self.reward == "potential":
+            discount = 1.0 if params.potential_discount is None else params.potential_discount
+            potentials = self._potential(before, params), self._potential(state, params)
+            reward += potential_difference(*potentials, discount, terminated)[None]
+        reward = _masked(reward, params.agent_mask)
         return state, TimeStep(self.observe(state, params), reward, terminated, truncated, info)
+
+    def _potential(self, state: SpreadState, params: SpreadParams) -> Float[Array, "*e"]:
+        def one(positions: Float[Array, "N 2 *e"], landmarks: Float[Array, "L 2 *e"]) -> Float[Array, "*e"]:
+            if positions.ndim > 2:
+                return jax.vmap(one, in_axes=-1, out_axes=-1)(positions, landmarks)
+            return assignment_potential(positions, landmarks, params.agent_mask, params.landmark_mask)
+
+        return one(state.positions, state.landmarks)
 
     def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, "N *e"]:
         """MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""

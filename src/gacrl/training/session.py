@@ -14,6 +14,7 @@ import numpy as np
 
 from gacrl import config as configuration
 from gacrl import envs, render
+from gacrl.algorithm_config import LearningConfig
 from gacrl.algorithms import algorithm as algorithms
 from gacrl.config import RunConfig
 from gacrl.envs import scripted
@@ -70,6 +71,8 @@ class Watcher:
 def build(config: RunConfig) -> Trainer:
     """The compiled functions that train this configuration."""
     env = envs.make(config.env)
+    if config.env.reward == "potential" and isinstance(config.algorithm, LearningConfig):
+        env = replace(env, initial_params=env.initial_params._replace(potential_discount=config.algorithm.gamma))
     if config.curriculum.num_agents_start is not None:
         env = env.padded()
     return Trainer(
