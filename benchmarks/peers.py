@@ -23,7 +23,7 @@ PACKAGES = {
     "jaxmarl": ("jaxmarl==0.2.0", "distrax", "flashbax", "hydra-core", "omegaconf", "wandb"),
     "benchmarl": (TORCH, "benchmarl==1.5.2", "vmas==1.5.2"),
 }
-ONE_THREAD = {name: "1" for name in ("NPROC", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+ONE_THREAD = dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
 def python_of(peer: str) -> str | None:
