@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak lint types bench clean
+.PHONY: train test soak lint types bench bench-short clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
@@ -22,8 +22,12 @@ lint: $(STAMP)
 types: $(STAMP)
 	"$(BIN)/pyright"
 
-bench: $(STAMP)  ## side by side with a plain PyTorch program, in an environment of its own
+bench: $(STAMP)  ## side by side with peers, in environments of their own; fails where a ratio has fallen
+	"$(BIN)/python" benchmarks/guard.py
 	"$(BIN)/python" benchmarks/paper_schedule.py
+
+bench-short: $(STAMP)  ## compiled programs have not grown
+	"$(BIN)/python" benchmarks/guard.py --short
 
 $(STAMP): pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit("gacrl needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'

@@ -1,0 +1,101 @@
+"""Has anything become slower? Ratios, and counts of instructions, against `benchmarks/baseline.json`.
+
+    python benchmarks/guard.py [--rounds 5] [--core 0] [--write]
+    python benchmarks/guard.py --short                  # instructions alone: a few seconds, for CI
+
+Fails where a ratio to a peer has fallen by more than 15 %, or a compiled program has grown by as much. Absolute times
+are never compared. Instruction counts hold for one version of JAX: with another they are printed and not judged.
+--write makes what was measured the new baseline.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import environment
+import peers
+
+BASELINE = Path(__file__).parent / "baseline.json"
+TOLERANCE = 0.15
+
+
+def instructions() -> dict[str, int]:
+    """Instructions in the compiled programs: the training loop of the paper's schedule, and a step of 32 copies."""
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax()
+    import jax
+    import jax.numpy as jnp
+
+    import gacrl
+    from gacrl.envs import copies
+    from gacrl.envs.spread import Spread
+    from gacrl.training import session
+
+    trainer = session.build(gacrl.preset("paper"))
+    env = Spread()
+    params = env.default_params()
+    state = copies.reset(env, params, jax.random.split(jax.random.key(0), 32))[0]
+    step = jax.jit(lambda state, action, key: copies.step(env, params, state, action, key))
+    programs = {
+        "paper": trainer.chunk.lower(trainer.init((0,)), jnp.int32(1)),
+        "environment": step.lower(state, jnp.zeros((32, 3), jnp.int32), jax.random.key(0)),
+    }
+    return {name: program.compile().as_text().count(" = ") for name, program in programs.items()}
+
+
+def fallen(
+    name: str, now: Mapping[str, Mapping[str, Sequence[float]]], before: Mapping[str, Mapping[str, float]]
+) -> list[str]:
+    """Print the table of these ratios; those that fell too far."""
+    found: list[str] = []
+    for peer, sizes in now.items():
+        for size, values in sizes.items():
+            was, ratio = before.get(peer, {}).get(size), statistics.median(values)
+            bad = was is not None and ratio < (1 - TOLERANCE) * was
+            label = f"{name}: {peer} at {size}"
+            print(f"{label:40} {peers.spread(values):32} baseline {was or 'none'}{'  FALLEN' * bad}")
+            found += [label] * bad
+    return found
+
+
+def grown(now: Mapping[str, int], before: Mapping[str, int]) -> list[str]:
+    """Print the counts; those that grew too far."""
+    for name, count in now.items():
+        print(f"{f'instructions: {name}':40} {count:<32} baseline {before.get(name, 'none')}")
+    return [f"instructions: {name}" for name, n in now.items() if n > (1 + TOLERANCE) * before.get(name, n)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--short", action="store_true", help="count instructions, measure nothing")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each side, per size")
+    parser.add_argument("--core", type=int, default=0, help="the core that all sides are pinned to")
+    parser.add_argument("--write", action="store_true", help="make what was measured the baseline")
+    asked = parser.parse_args()
+    import jax
+
+    baseline: dict[str, Any] = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.exists() else {}
+    counts = instructions()
+    same_version = baseline.get("jax") == jax.__version__
+    bad = grown(counts, baseline.get("instructions", {}) if same_version else {})
+    if not same_version:
+        print(f"the baseline was counted with jax {baseline.get('jax', '(none)')}, this is {jax.__version__}")
+    measured = {}
+    if not asked.short:
+        ratios = environment.compare(asked.rounds, asked.core)
+        bad += fallen("environment", ratios, baseline.get("environment", {}))
+        measured = {"environment": peers.summary(ratios)["ratio"]}
+    if asked.write:
+        baseline |= {"jax": jax.__version__, "instructions": counts, **measured}
+        BASELINE.write_text(json.dumps(baseline, indent=2) + "\n", encoding="utf-8")
+    elif bad:
+        sys.exit(f"slower than {BASELINE.name} by more than {TOLERANCE:.0%}: {'; '.join(bad)}")
+
+
+if __name__ == "__main__":
+    main()
