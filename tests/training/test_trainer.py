@@ -81,7 +81,8 @@ def test_a_second_chunk_compiles_nothing_whatever_its_length(
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         for progress in train(trainer, config, trainer.init(config.seeds)):
             state = without_padding(progress.state, 2)
-            checkpoint.save(tmp_path, state, progress.env_steps, "", {})
+            tensors = checkpoint.serialise(checkpoint.arrays(state))
+            checkpoint.save(tmp_path, tensors, progress.env_steps, "", {})
             assert state.updates.tolist() == [progress.env_steps] * 2
             counts.append(len(compiled(caplog.records)))
             if len(counts) == 1:

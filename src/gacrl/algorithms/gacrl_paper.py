@@ -331,7 +331,7 @@ def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | 
         kl_weight=config.kl_weight,
     )
 
-    blank, unpack = ring.packing(no_experience(num_agents, observation_size))
+    blank, unpack = ring.packing(jax.eval_shape(lambda: no_experience(num_agents, observation_size)))
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
@@ -345,7 +345,7 @@ def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | 
         return LearnerState(
             network=network,
             optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            replay=ring.empty(blank, config.replay_capacity),
+            replay=ring.empty(jnp.zeros(blank.shape), config.replay_capacity),
             coverage=no_coverage(),
             hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
         )

@@ -139,9 +139,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         step = Transition(observation, Decision(choice), after.reward, false, false, false, after.observation, {})
         return Experience(step, nothing_remembered)
 
-    packed, unpack = ring.packing(
-        jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(example))
-    )
+    packed, unpack = ring.packing(jax.eval_shape(example))
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
         network = parts.networks(key)

@@ -89,6 +89,16 @@ def pack(item: object) -> Float[Array, " W"]:
     return ravel_pytree(item)[0]
 
 
-def packing(example: Item) -> tuple[Float[Array, " W"], Callable[[Float[Array, " W"]], Item]]:
-    """An empty item as a vector, and the inverse of `pack`."""
-    return ravel_pytree(jax.tree.map(jnp.zeros_like, example))
+def packing(example: Item) -> tuple[jax.ShapeDtypeStruct, Callable[[Float[Array, " W"]], Item]]:
+    """The shape of an item as a vector, and the inverse of `pack`; nothing is allocated.
+
+    example: an item, or its shapes.
+    """
+    unpack: list[Callable[[Float[Array, " W"]], Item]] = []
+
+    def pack_one(item: Item) -> Float[Array, " W"]:
+        packed, inverse = ravel_pytree(item)
+        unpack.append(inverse)
+        return packed
+
+    return jax.eval_shape(pack_one, example), unpack[0]

@@ -9,7 +9,7 @@ from typing import Any
 from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.training import session
-from gacrl.training.loop import Diverged
+from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Run, Watcher
 

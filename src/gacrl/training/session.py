@@ -3,8 +3,8 @@
 import platform
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,19 @@ from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
-from gacrl.training import checkpoint, curriculum
+from gacrl.training import checkpoint, curriculum, memory
 from gacrl.training.devices import devices_for, one_seed, shard_seeds, without_padding
+from gacrl.training.divergence import Diverged
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.writer import Writer
 from gacrl.types import Learner
 
+SCORE = "return_agent_mean"
+"""The best policy is the one with the highest greedy mean of this, over all seeds."""
+ROWS = "rows"
+"""What a checkpoint calls the number of lines that metrics.jsonl had by then."""
 SHOWN_EPISODES = 4
 """Episodes that a run keeps, and shows in its GIF."""
 
@@ -52,6 +58,8 @@ class Plan:
     """Numbers that a seed's network learns."""
     bytes_per_seed: int
     """Memory of a seed's training state (networks, optimiser, replay, environments)."""
+    bytes_needed: int
+    """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it."""
     devices: tuple[str, ...]
 
 
@@ -88,22 +96,28 @@ def evaluation_env(config: RunConfig) -> Spread:
 
 
 def plan(trainer: Trainer, config: RunConfig) -> Plan:
-    """Count what a run needs, without allocating it."""
-    member = _member_shapes(trainer)
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
+    """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
+    member, devices = _member_shapes(trainer), devices_for(config.num_seeds)
+    state, working = memory.size(member), memory.working_bytes(config, member)
+    needed = 2 * state * config.num_seeds + working * len(devices)
+    memory.require_room(needed, devices[0])
     network = getattr(member.learner, "network", ())
     return Plan(
         parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
-        bytes_per_seed=size,
-        devices=tuple(f"{device.platform}:{device.id}" for device in devices_for(config.num_seeds)),
+        bytes_per_seed=state,
+        bytes_needed=needed,
+        devices=tuple(f"{device.platform}:{device.id}" for device in devices),
     )
 
 
 def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
     """Train from the beginning, into a new run folder."""
+    watcher, trainer = watcher or Watcher(), build(config)
+    planned = plan(trainer, config)
     folder = RunFolder.create(out, config)
     with folder.locked():
-        return _run(folder, config, None, watcher or Watcher(), configuration.fingerprint(config))
+        watcher.planned(folder, config, planned)
+        return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config))
 
 
 def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
@@ -112,62 +126,131 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     folder = RunFolder.open(path)
     with folder.locked():
         config = folder.config()
-        fingerprint = configuration.fingerprint(folder.settings())
-        found: checkpoint.Checkpoint | None = None
-        if any(folder.checkpoints.glob("step-*")):
-            found, warnings = checkpoint.newest(folder.checkpoints)
-            for warning in warnings:
-                watcher.warn(warning)
-            if found.fingerprint != fingerprint:
-                raise UserError(
-                    f"{found.folder} was trained with other settings than {folder.config_file} now says: "
-                    "put the file back as it was, or train into a new folder"
-                )
+        found = newest_checkpoint(folder, watcher.warn)
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-            folder.extend(steps)
-        return _run(folder, config, found, watcher, fingerprint)
+        trainer = build(config)
+        planned = plan(trainer, config)
+        if found is not None:
+            checkpoint.set_aside_after(folder.checkpoints, found.env_steps)
+        if extend is not None:
+            folder.extend(config.training.env_steps)
+        watcher.planned(folder, config, planned)
+        fingerprint = configuration.fingerprint(folder.settings())
+        return _run(folder, config, trainer, found, watcher, fingerprint)
+
+
+def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
+    """Where a run can go on: at its newest intact checkpoint; None where it has not come to one yet.
+
+    Raises UserError for checkpoints that are all damaged or gone, or of other settings.
+    """
+    if not any(folder.checkpoints.glob(f"{checkpoint.STEP}*")):
+        rows = folder.metrics() if folder.metrics_file.exists() else []
+        if len({row["env_steps"] for row in rows}) > 1:  # an evaluation may be ahead of its checkpoint
+            raise UserError(
+                f"{folder.checkpoints} has lost its checkpoints: train the run again into a new folder"
+            )
+        return None
+    found, warnings = checkpoint.newest(folder.checkpoints)
+    for warning in warnings:
+        warn(warning)
+    if found.fingerprint != configuration.fingerprint(folder.settings()):
+        raise UserError(
+            f"{found.folder} was trained with other settings than {folder.config_file} now says: "
+            "put the file back as it was, or train into a new folder"
+        )
+    return found
+
+
+def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
+    """The training state of a checkpoint, laid out on the devices; a fresh one without."""
+    if found is None:
+        return trainer.init(config.seeds)
+    return shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
 
 
 def _run(
     folder: RunFolder,
     config: RunConfig,
+    trainer: Trainer,
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
 ) -> Run:
-    trainer = build(config)
-    watcher.planned(folder, config, plan(trainer, config))
+    env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
+    state = restore(trainer, config, found)
     try:
-        if found is None:
-            folder.forget_metrics_after(0)
-            env_steps, clock, state = 0, Clock(), trainer.init(config.seeds)
-        else:
-            folder.forget_metrics_after(found.env_steps)
-            env_steps, clock = found.env_steps, Clock(**found.counters)
-            state = shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
-        for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
-            env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-            folder.append_metrics(list(progress.rows))
-            checkpoint.save(
-                folder.checkpoints,
-                without_padding(state, config.num_seeds),
-                env_steps,
-                fingerprint,
-                vars(clock),
+        rows = folder.forget_metrics_after(env_steps)
+        if found is not None and rows != found.counters.get(ROWS, rows):
+            watcher.warn(
+                f"{folder.metrics_file} has {rows} of the {found.counters[ROWS]} lines that were written up to "
+                f"environment step {env_steps}: the others are lost, what follows is not"
             )
-            watcher.progress(progress)
-            if watcher.stop() and not progress.done:
-                return Run(folder.path, config, env_steps, None)
+        with Writer() as writer:
+            keep = _Keeper(folder, config.num_seeds, fingerprint, writer, rows)
+            for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
+                env_steps, state, clock = progress.env_steps, progress.state, progress.clock
+                writer.wait()  # one evaluation at most is ahead of its checkpoint
+                folder.append_metrics(list(progress.rows))
+                keep(progress)
+                watcher.progress(progress)
+                if watcher.stop() and not progress.done:
+                    return Run(folder.path, config, env_steps, None)
         watcher.finishing()
         summary = _finish(folder, config, trainer, state, env_steps, clock)
+    except Diverged as error:
+        raise Diverged(
+            f"{error}, or see the first bad update with `gacrl resume {folder.path} --diagnose`, which begins at "
+            f"{'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
+        ) from error
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
             f"then `gacrl resume {folder.path}` goes on from the last checkpoint"
         ) from error
     return Run(folder.path, config, env_steps, summary)
+
+
+class _Keeper:
+    """Keeps the whole state after every chunk, and the policy where it is the best so far, in the background."""
+
+    def __init__(self, folder: RunFolder, num_seeds: int, fingerprint: str, writer: Writer, rows: int):
+        self._num_seeds, self._writer, self._rows = num_seeds, writer, rows
+        self._save = partial(checkpoint.save, folder.checkpoints, fingerprint=fingerprint)
+        self._best = _best_score(folder.checkpoints)
+
+    def __call__(self, progress: Progress) -> None:
+        state, env_steps = checkpoint.arrays(without_padding(progress.state, self._num_seeds)), progress.env_steps
+        self._rows += len(progress.rows)
+        counters = {**asdict(progress.clock), ROWS: self._rows}
+        writes = [partial(self._save, checkpoint.serialise(state), env_steps, counters=counters)]
+        score = float(np.mean([row["greedy"][SCORE] for row in progress.rows]))
+        if score > self._best:
+            self._best = score
+            policy = checkpoint.serialise({name: it for name, it in state.items() if acts(name)})
+            writes.append(partial(self._save, policy, env_steps, counters={SCORE: score}, kind=checkpoint.BEST))
+        self._writer.submit(lambda: [write() for write in writes])
+
+
+def _best_score(checkpoints: Path) -> float:
+    """Of the best policy that is kept; −∞ where there is none."""
+    try:
+        return checkpoint.newest(checkpoints, checkpoint.BEST)[0].counters[SCORE]
+    except (UserError, KeyError):
+        return -np.inf
+
+
+def acts(name: str) -> bool:
+    """Whether a saved array is one that a policy needs."""
+    return name.startswith(".learner") and not name.removeprefix(".learner").startswith(FOR_LEARNING)
+
+
+def _clock(found: checkpoint.Checkpoint) -> Clock:
+    """The clock as it stood at a checkpoint."""
+    known = asdict(Clock())
+    return Clock(**{name: value for name, value in found.counters.items() if name in known})  # pyright: ignore[reportArgumentType]
 
 
 def _finish(
