@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak lint types bench clean
+.PHONY: train test soak lint types bench lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
@@ -25,10 +25,17 @@ types: $(STAMP)
 bench: $(STAMP)  ## side by side with a plain PyTorch program, in an environment of its own
 	"$(BIN)/python" benchmarks/paper_schedule.py
 
-$(STAMP): pyproject.toml
+lock:  ## pin what CI installs anew: the newest of everything that pyproject.toml allows
+	"$(PYTHON)" -m venv .venv-lock
+	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check ".[dev]"
+	{ echo "# What CI installs; made by \`make lock\`. Nightly builds are left out: registries drop them."; \
+	  .venv-lock/bin/python -m pip freeze --exclude gacrl | grep -v nightly; } > constraints.txt
+	rm -rf .venv-lock
+
+$(STAMP): pyproject.toml constraints.txt
 	"$(PYTHON)" -c 'import sys; sys.exit("gacrl needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
 	"$(PYTHON)" -m venv .venv
-	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt --editable ".[dev]"
 	touch "$@"
 
 clean:

@@ -359,7 +359,9 @@ def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
     )
     trainer = Trainer(algorithm, CLOSE, constant(), E, T)
     monkeypatch.setattr(trainer, "evaluate", lambda *how: {"return_agent_mean": np.zeros((1, 1))})
-    with pytest.raises(UserError, match=r"seed 0 diverged: loss is nan by environment step 6; .*smaller learning"):
+    with pytest.raises(
+        UserError, match=r"seed 0 diverged between environment steps 0 and 6: loss is nan; .*smaller learning"
+    ):
         next(train(trainer, config, trainer.init((0,))))
 
 
