@@ -308,8 +308,11 @@ def print_diagnosis(found: Diagnosis) -> None:
     if bad is None:
         console.print(f"every update from environment step {found.begun_at} to {found.ended_at} is finite")
         return
-    title = f"seed {bad.seed}: update {bad.update}, up to environment step {bad.env_steps}, is the first bad one"
-    table = Table("", "before", "then", title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    console.print(
+        f"seed {bad.seed}: update {bad.update}, up to environment step {bad.env_steps}, is the first bad one",
+        soft_wrap=True,
+    )
+    table = Table("", "before", "then", box=box.SIMPLE_HEAD)
     for name, (before, then) in bad.metrics.items():
         table.add_row(name, "" if before is None else f"{before:.6g}", f"{then:.6g}")
     console.print(table)

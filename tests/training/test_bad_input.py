@@ -33,6 +33,7 @@ pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("r
 
 FEW = int(os.environ.get("GACRL_FUZZ", "40"))
 MANY = 25 * FEW
+BUILD = session.build
 COMMANDS = ("resume", "evaluate", "compare")
 
 
@@ -49,7 +50,7 @@ def traced_once() -> Iterator[None]:
     """What is searched is what reads: trainers are kept, scripted policies and pictures are not made."""
     with pytest.MonkeyPatch.context() as patch:
         references = {name: {"return_agent_mean": float(k)} for k, name in enumerate(("random", "noop", "oracle"))}
-        patch.setattr(session, "build", functools.cache(session.build))
+        patch.setattr(session, "build", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
         patch.setattr(session.episodes, "record_many", lambda *_: [])
@@ -337,7 +338,7 @@ def extreme(draw: st.DrawFn) -> RunConfig:
 
 def check_plan(config: RunConfig) -> None:
     with contextlib.suppress(UserError):
-        planned = session.plan(session.build(config), config)
+        planned = session.plan(BUILD(config), config)
         assert planned.bytes_needed >= planned.bytes_per_seed > 0
 
 

@@ -2,12 +2,12 @@
 
 import contextlib
 import functools
-import io
 import json
 import os
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -25,6 +25,7 @@ import pytest
 from conftest import TinyRun
 
 from gacrl import config as configuration
+from gacrl import play
 from gacrl.algorithms.algorithm import Algorithm
 from gacrl.cli import main
 from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
@@ -34,19 +35,30 @@ from gacrl.training import checkpoint, session
 from gacrl.training.divergence import Diverged, not_finite
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
+from gacrl.training.trainer import Trainer
 from gacrl.training.writer import Writer
 from gacrl.types import Decision
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
+BUILD = session.build
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def traced_once() -> Iterator[None]:
-    """A run that is gone on with has the trainer that it had: nothing is traced again. And no tables of the paper."""
+    """A run that is gone on with has the trainer that it had: nothing is traced again. And nothing is drawn."""
+    kept = functools.cache(BUILD)
+
+    def build(config: RunConfig) -> Any:
+        return kept(
+            replace(config, training=replace(config.training, env_steps=450))
+        )  # of no matter to the paper's
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "build", functools.cache(session.build))
+        patch.setattr(session, "build", build)
+        patch.setattr(session.episodes, "record_many", lambda *_: [])
+        patch.setattr(session.render, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])
         patch.setattr(paper_tables, "table_3", lambda *_: [])
         yield
@@ -311,11 +323,28 @@ def test_evaluations_that_are_gone_are_told(copy: Path, said: Callable[..., tupl
     )
 
 
+# The network.
+
+
+def test_nothing_is_fetched(copy: Path, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch):
+    """Training, its closing evaluation, and playing, without a network. (A process from its first line: test_resume.py.)"""
+
+    def offline(*address: Any) -> None:
+        raise AssertionError(f"the network is asked for {address}")
+
+    for name in ("connect", "connect_ex", "sendto"):
+        monkeypatch.setattr(socket.socket, name, offline)
+    for name in ("getaddrinfo", "gethostbyname", "create_connection"):
+        monkeypatch.setattr(socket, name, offline)
+    assert said("resume", copy, "--extend", 60) == (0, "")
+    assert said("evaluate", copy, "--episodes", 8) == (0, "")
+
+
 # The best.
 
 
-def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path, said: Callable[..., tuple[int, str]]):
-    """Its parameters are those of the step that it names, and `@best` plays them."""
+def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path):
+    """Its parameters are those of the step that it names, and `RUN@best` has them."""
     (best,) = (copy / "checkpoints").glob("best-*")
     returns: dict[int, list[float]] = {}
     for row in rows(copy):
@@ -337,11 +366,12 @@ def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path, said: Callabl
         np.float32([values.mean() for values in jax.device_get(played["return_agent_mean"])]),
         np.float32(returns[found.env_steps]),
     )
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert main(["evaluate", f"{copy}@best", "--episodes", "4", "--json"]) == 0
-    again = trainer.evaluate(learners, False, "report", 4)["return_agent_mean"]
-    told = json.loads(out.getvalue().splitlines()[-1])["final"]["greedy"]["return_agent_mean"]["values"]
-    np.testing.assert_array_equal(told, [float(values.mean()) for values in jax.device_get(again)])
+    opened = play.open_run(f"{copy}@1@best")
+    assert opened.env_steps == found.env_steps
+    for here, there in zip(
+        jax.tree.leaves(opened.learners.network), jax.tree.leaves(learners.network), strict=True
+    ):
+        np.testing.assert_array_equal(here[0], np.asarray(there)[1])
 
 
 # Divergence.
@@ -384,7 +414,8 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     """The loss stays finite: it is a parameter, of the fifth update, that is not."""
     folder = tmp_path / "run"
     monkeypatch.setattr(session.algorithms, "make", lambda *_: breaking(at=5, loss=2.0))
-    monkeypatch.setattr(session, "build", functools.cache(session.build.__wrapped__))
+    monkeypatch.setattr(session, "build", functools.cache(BUILD))
+    monkeypatch.setattr(Trainer, "evaluate", lambda *_: {"return_agent_mean": np.zeros((1, 2))})
     with pytest.raises(Diverged) as stopped:
         session.start(SHORT, folder)
     assert str(stopped.value) == (
@@ -439,6 +470,7 @@ def test_what_is_not_finite_is_named():
 def test_what_cannot_fit_is_refused_with_the_number(
     words: str, tmp_path: Path, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(session, "build", BUILD)
     monkeypatch.setattr(session.memory, "memory_of", lambda device: 16 * 2**30)
     out = tmp_path / "run"
     before = int(Path("/proc/self/statm").read_text().split()[1])
@@ -455,8 +487,9 @@ def test_what_cannot_fit_is_refused_with_the_number(
 
 def test_the_plan_of_a_run_counts_its_replay():
     config = configuration.preset("gacrl")
-    planned = session.plan(session.build(config), config)
-    member = jax.eval_shape(lambda: session.build(config).init_stacked((0,)))
+    trainer = BUILD(config)
+    planned = session.plan(trainer, config)
+    member = jax.eval_shape(lambda: trainer.init_stacked((0,)))
     state = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
     assert planned.bytes_per_seed == state
     assert planned.bytes_per_seed > 150_000 * 4 * 100

@@ -34,6 +34,7 @@ pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("r
 
 STEPS, CHUNK, LAST = 450, 60, 30
 """The tiny run's."""
+OFFLINE = "import socket; socket.socket.connect = socket.socket.sendto = socket.getaddrinfo = None"
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 
@@ -63,7 +64,7 @@ def process(quick_start: dict[str, str]) -> Iterator[Any]:
     running: list[subprocess.Popen[str]] = []
 
     def start(*words: object) -> subprocess.Popen[str]:
-        code = "import jax, sys; jax.config.update('jax_num_cpu_devices', 2); import gacrl.cli; sys.exit(gacrl.cli.main())"
+        code = f"{OFFLINE}; import jax, sys; jax.config.update('jax_num_cpu_devices', 2); import gacrl.cli; sys.exit(gacrl.cli.main())"
         running.append(
             subprocess.Popen(
                 [sys.executable, "-c", code, *map(str, words)],

@@ -151,6 +151,7 @@ def test_killed_again_and_again(start: Any, tmp_path: Path):
             seen.before_a_checkpoint += not any(folder.glob("checkpoints/step-*"))
             found = rows(folder)
             assert found == expected[: len(found)], "every evaluation once, none missing"
+            print(seen.kills, words[0], len(found) - begun_with, flush=True)
             if folder.exists() and not (folder / "config.json").exists():
                 shutil.rmtree(folder)  # killed before it had its settings
             continue
