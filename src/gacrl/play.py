@@ -18,7 +18,7 @@ from gacrl.config import EnvConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
-from gacrl.training import checkpoint, session
+from gacrl.training import checkpoint, keeper, session
 from gacrl.training.devices import one_seed
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
@@ -120,7 +120,7 @@ def save_policy(run: str | Path, out: Path) -> Path:
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
     state, fingerprint = _Acting(jax.tree.map(jnp.asarray, opened.learners)), configuration.fingerprint(config)
-    named = {name: array for name, array in checkpoint.arrays(state).items() if session.acts(name)}
+    named = {name: array for name, array in checkpoint.arrays(state).items() if keeper.acts(name)}
     checkpoint.save(out / "checkpoints", checkpoint.serialise(named), opened.env_steps, fingerprint, {})
     return out
 

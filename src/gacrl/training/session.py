@@ -4,7 +4,7 @@ import platform
 import subprocess
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -23,18 +23,15 @@ from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint, curriculum, memory
-from gacrl.training.devices import devices_for, one_seed, shard_seeds, without_padding
+from gacrl.training.devices import devices_for, one_seed, shard_seeds
 from gacrl.training.divergence import Diverged
+from gacrl.training.keeper import FOR_LEARNING, ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
 
-SCORE = "return_agent_mean"
-"""The best policy is the one with the highest greedy mean of this, over all seeds."""
-ROWS = "rows"
-"""What a checkpoint calls the number of lines that metrics.jsonl had by then."""
 SHOWN_EPISODES = 4
 """Episodes that a run keeps, and shows in its GIF."""
 
@@ -189,7 +186,7 @@ def _run(
                 f"environment step {env_steps}: the others are lost, what follows is not"
             )
         with Writer() as writer:
-            keep = _Keeper(folder, config.num_seeds, fingerprint, writer, rows)
+            keep = Keeper(folder, config.num_seeds, fingerprint, writer, rows)
             for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
                 env_steps, state, clock = progress.env_steps, progress.state, progress.clock
                 writer.wait()  # one evaluation at most is ahead of its checkpoint
@@ -211,40 +208,6 @@ def _run(
             f"then `gacrl resume {folder.path}` goes on from the last checkpoint"
         ) from error
     return Run(folder.path, config, env_steps, summary)
-
-
-class _Keeper:
-    """Keeps the whole state after every chunk, and the policy where it is the best so far, in the background."""
-
-    def __init__(self, folder: RunFolder, num_seeds: int, fingerprint: str, writer: Writer, rows: int):
-        self._num_seeds, self._writer, self._rows = num_seeds, writer, rows
-        self._save = partial(checkpoint.save, folder.checkpoints, fingerprint=fingerprint)
-        self._best = _best_score(folder.checkpoints)
-
-    def __call__(self, progress: Progress) -> None:
-        state, env_steps = checkpoint.arrays(without_padding(progress.state, self._num_seeds)), progress.env_steps
-        self._rows += len(progress.rows)
-        counters = {**asdict(progress.clock), ROWS: self._rows}
-        writes = [partial(self._save, checkpoint.serialise(state), env_steps, counters=counters)]
-        score = float(np.mean([row["greedy"][SCORE] for row in progress.rows]))
-        if score > self._best:
-            self._best = score
-            policy = checkpoint.serialise({name: it for name, it in state.items() if acts(name)})
-            writes.append(partial(self._save, policy, env_steps, counters={SCORE: score}, kind=checkpoint.BEST))
-        self._writer.submit(lambda: [write() for write in writes])
-
-
-def _best_score(checkpoints: Path) -> float:
-    """Of the best policy that is kept; −∞ where there is none."""
-    try:
-        return checkpoint.newest(checkpoints, checkpoint.BEST)[0].counters[SCORE]
-    except (UserError, KeyError):
-        return -np.inf
-
-
-def acts(name: str) -> bool:
-    """Whether a saved array is one that a policy needs."""
-    return name.startswith(".learner") and not name.removeprefix(".learner").startswith(FOR_LEARNING)
 
 
 def _clock(found: checkpoint.Checkpoint) -> Clock:
@@ -327,10 +290,6 @@ def versions() -> dict[str, str]:
 
 def _member_shapes(trainer: Trainer) -> TrainState:
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
-
-
-FOR_LEARNING = (".replay", ".optimizer", ".rewards")
-"""What a learner holds that acting does not need."""
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
