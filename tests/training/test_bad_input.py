@@ -113,7 +113,7 @@ THINGS = (
 def damages(draw: st.DrawFn) -> tuple[str, str, Any]:
     """A thing of a run folder, what is done to it, and where or with what."""
     what = draw(
-        st.sampled_from(["missing", "empty", "cut", "bytes", "folder", "file", "link", "dangling", "text"])
+        st.sampled_from(["missing", "empty", "cut", "bytes", "folder", "binary", "link", "dangling", "text"])
     )
     return (
         draw(st.sampled_from(THINGS)),
@@ -132,7 +132,6 @@ def spoil(folder: Path, outside: Path, thing: str, what: str, how: Any) -> None:
         path.unlink()
     elif path.is_dir():
         shutil.rmtree(path)
-    path.parent.mkdir(parents=True, exist_ok=True) if path.parent.parent.is_dir() else None
     if what == "missing" or not path.parent.is_dir():
         return
     if what == "folder":
@@ -142,17 +141,13 @@ def spoil(folder: Path, outside: Path, thing: str, what: str, how: Any) -> None:
         path.symlink_to(outside)
     elif what == "dangling":
         path.symlink_to(outside / "nothing")
+    elif what == "cut":
+        path.write_bytes(data[: int(how * len(data))])
     elif what == "bytes":
         position = int(how * max(len(data) - 1, 0))
-        path.write_bytes(
-            data[:position] + bytes([data[position] ^ 0x55]) + data[position + 1 :] if data else b"\xff"
-        )
+        path.write_bytes(data[:position] + b"\x55" + data[position + 1 :])
     else:
-        path.write_bytes(
-            {"empty": b"", "cut": data[: int(float(how) * len(data))]}.get(what, str(how).encode())
-            if what != "file"
-            else b"\x00\xff{"
-        )
+        path.write_bytes({"empty": b"", "binary": b"\x00\xff{"}.get(what, str(how).encode()))
 
 
 def check_damages(tiny_run: TinyRun, damage: list[tuple[str, str, Any]], link_to_file: bool, command: str) -> None:

@@ -249,6 +249,7 @@ def _finish(
     shown = episodes.record_many(
         env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
     )
+    folder.episodes.mkdir(exist_ok=True)
     for number, episode in enumerate(shown):
         episode.save(folder.episodes / f"{number}.npz")
     render.gif(shown, folder.gif, title=f"{config.preset}, seed {config.seed}")
@@ -301,5 +302,6 @@ def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
 
 def _stacked_shapes(trainer: Trainer) -> TrainState:
     """The shapes of the training state of all seeds, as a checkpoint holds it."""
-    seeds = tuple(range(trainer.num_seeds))
-    return jax.eval_shape(lambda: trainer.init_stacked(seeds))
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((trainer.num_seeds, *leaf.shape), leaf.dtype), _member_shapes(trainer)
+    )
