@@ -80,15 +80,16 @@ class Seen:
 
 
 @pytest.fixture
-def start(quick_start: dict[str, str]) -> Iterator[Any]:
+def start(quick_start: dict[str, str], tmp_path: Path) -> Iterator[Any]:
     children: list[subprocess.Popen[bytes]] = []
+    errors = (tmp_path / "errors").open("ab")
 
     def run(*words: object) -> subprocess.Popen[bytes]:
         child = subprocess.Popen(
             [sys.executable, "-m", "gacrl", *map(str, words)],
             env=quick_start,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
+            stderr=errors,
         )
         resource.prlimit(child.pid, resource.RLIMIT_DATA, (MEMORY, MEMORY))
         children.append(child)
@@ -98,6 +99,7 @@ def start(quick_start: dict[str, str]) -> Iterator[Any]:
     for child in children:
         child.kill()
         child.wait()
+    errors.close()
 
 
 def wait_to_kill(child: subprocess.Popen[bytes], folder: Path, chance: random.Random, begun_with: int) -> None:
@@ -155,7 +157,7 @@ def test_killed_again_and_again(start: Any, tmp_path: Path):
             if folder.exists() and not (folder / "config.json").exists():
                 shutil.rmtree(folder)  # killed before it had its settings
             continue
-        assert child.returncode == 0, child.communicate()[1]
+        assert child.returncode == 0, (tmp_path / "errors").read_text()
         seen.finished += 1
         summary = json.loads((folder / "summary.json").read_text())
         assert rows(folder) == expected

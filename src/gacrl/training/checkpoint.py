@@ -6,6 +6,7 @@ another name, synced to the disk, and renamed. No pickle, nothing that can run c
 another, of the policy alone, as it was when it scored best.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -140,7 +141,10 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
             name = prefix + inside
             is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
-            found = file.get_tensor(name) if name in saved else None
+            found = None
+            if name in saved:
+                with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
+                    found = file.get_tensor(name)
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
                 raise UserError(
