@@ -26,12 +26,13 @@ from gacrl import config as configuration
 from gacrl.cli import main
 from gacrl.config import PRESETS, RunConfig
 from gacrl.errors import ConfigError, UserError
+from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments import paper_tables, scoring
 from gacrl.training import checkpoint, session
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
-FEW = int(os.environ.get("GACRL_FUZZ", "40"))
+FEW = int(os.environ.get("GACRL_FUZZ", "25"))
 MANY = 25 * FEW
 BUILD = session.build
 COMMANDS = ("resume", "evaluate", "compare")
@@ -49,7 +50,9 @@ def searched(count: int) -> Any:
 def traced_once() -> Iterator[None]:
     """What is searched is what reads: trainers are kept, scripted policies and pictures are not made."""
     with pytest.MonkeyPatch.context() as patch:
-        references = {name: {"return_agent_mean": float(k)} for k, name in enumerate(("random", "noop", "oracle"))}
+        references = {
+            name: dict.fromkeys(EPISODE_METRICS, float(k)) for k, name in enumerate(("random", "noop", "oracle"))
+        }
         patch.setattr(session, "build", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
