@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak lint types bench bench-short clean
+.PHONY: train test soak lint types bench bench-short lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
@@ -29,10 +29,17 @@ bench: $(STAMP)  ## side by side with peers, in environments of their own; fails
 bench-short: $(STAMP)  ## compiled programs have not grown
 	"$(BIN)/python" benchmarks/guard.py --short
 
-$(STAMP): pyproject.toml
+lock:  ## pin what CI installs anew: the newest of everything that pyproject.toml allows
+	"$(PYTHON)" -m venv .venv-lock
+	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check ".[dev]"
+	{ echo "# What CI installs; made by \`make lock\`. Nightly builds are left out: registries drop them."; \
+	  .venv-lock/bin/python -m pip freeze --exclude gacrl | grep -v nightly; } > constraints.txt
+	rm -rf .venv-lock
+
+$(STAMP): pyproject.toml constraints.txt
 	"$(PYTHON)" -c 'import sys; sys.exit("gacrl needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
 	"$(PYTHON)" -m venv .venv
-	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt --editable ".[dev]"
 	touch "$@"
 
 clean:

@@ -289,7 +289,9 @@ def test_training_leaves_what_it_says(tiny_run: TinyRun):
     assert [row["episodes_done"] for row in rows[::2]] == [4, 8, 12, 16, 20, 24, 28, 30]
     assert [row["train"]["episodes"] for row in rows[::2]] == [4] * 7 + [2]
     assert [row["seed"] for row in rows] == [5, 6] * 8
+    returns = [np.mean([row["greedy"]["return_agent_mean"] for row in rows[k : k + 2]]) for k in range(0, 16, 2)]
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [
+        f"best-{rows[2 * int(np.argmax(returns))]['env_steps']:012d}",
         "step-000000000420",
         "step-000000000450",
     ]

@@ -50,12 +50,16 @@ class Resume:
     examples:
       gacrl resume runs/paper-1
       gacrl resume runs/paper-1 --extend 37500        500 more episodes of 75 steps
+      gacrl resume runs/paper-1 --diagnose            which update it was that diverged
     """
 
     run: tyro.conf.Positional[Path]
     """A run folder."""
     extend: int | None = None
     """Environment steps to train past the planned end."""
+    diagnose: bool = False
+    """Play what follows the newest checkpoint again, one update at a time, and print the first that is not finite;
+    nothing is written."""
     json: bool = False
     """Make the last line of the output one JSON object."""
 
@@ -64,8 +68,9 @@ class Resume:
 class Evaluate:
     """Measure a policy on fixed episodes: greedy and sampled, beside random, noop and oracle.
 
-    RUN is a run folder, FOLDER@k for its member k, or random, noop, oracle, or local (an oracle that sees what is
-    near and assigns nothing). Every score_ is 0 for random and 1 for oracle on the same starts.
+    RUN is a run folder, FOLDER@k for its member k, FOLDER@best for how it was when it scored best, or random, noop,
+    oracle, or local (an oracle that sees what is near and assigns nothing). Every score_ is 0 for random and 1 for
+    oracle on the same starts.
 
     examples:
       gacrl evaluate runs/paper-1

@@ -8,7 +8,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
+    from gacrl.arguments import Resume
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.reproduce import Reproduction
     from gacrl.experiments.study import Watch
@@ -105,6 +106,8 @@ def _resume(words: list[str]) -> int:
     asked = arguments.parse(arguments.Resume, words, "resume")
     if asked.extend is not None and asked.extend < 1:
         raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
+    if asked.diagnose:
+        return _diagnose(asked)
 
     def resume(watcher: "Watcher") -> "Run":
         from gacrl.training import devices, recorder, session
@@ -113,6 +116,23 @@ def _resume(words: list[str]) -> int:
         return session.resume(asked.run, asked.extend, watcher)
 
     return _watched(resume, asked.json)
+
+
+def _diagnose(asked: "Resume") -> int:
+    from gacrl.training import devices, recorder
+
+    devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
+    from gacrl.progress import TerminalWatcher, print_diagnosis
+    from gacrl.training import diagnosis
+
+    if asked.extend is not None:
+        raise UserError("--diagnose writes nothing: leave --extend out")
+    with TerminalWatcher() as terminal:
+        found = diagnosis.diagnose(asked.run, terminal.watcher())
+    print_diagnosis(found)
+    if asked.json:
+        print(json.dumps(asdict(found)))
+    return 0
 
 
 def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:

@@ -18,7 +18,7 @@ from gacrl.config import EnvConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
-from gacrl.training import checkpoint, session
+from gacrl.training import checkpoint, keeper, session
 from gacrl.training.devices import one_seed, rows
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
@@ -54,10 +54,12 @@ def open_run(
 ) -> TrainedRun:
     """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
 
+    `@best` behind it takes the parameters that scored best while training, instead of the newest.
+
     change: what to alter about the task. Raises UserError for a folder that holds no run, or parameters that
     do not fit the task.
     """
-    path, member = _split(str(run))
+    path, member, kind = _split(str(run))
     folder = RunFolder.open(path)
     config = folder.config()
     changed = replace(
@@ -72,7 +74,7 @@ def open_run(
             "number (equation (10) puts all messages side by side): leave --num-agents out"
         )
     trainer = session.build(changed)
-    found, warnings = checkpoint.newest(folder.checkpoints)
+    found, warnings = checkpoint.newest(folder.checkpoints, kind)
     for warning in warnings:
         warn(warning)
     learners = session.load_learners(found, trainer)
@@ -112,28 +114,31 @@ def save_policy(run: str | Path, out: Path) -> Path:
     """
     if out.exists():
         raise UserError(f"{out} exists: choose another folder")
-    path, member = _split(str(run))
-    opened = open_run(f"{path}@{member or 0}")
+    path, member, kind = _split(str(run))
+    opened = open_run(f"{path}@{member or 0}{'@best' if kind == checkpoint.BEST else ''}")
     config = replace(RunFolder.open(path).config(), seed=opened.config.seed, num_seeds=1)
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
-    skip = tuple(f".learner{name}" for name in session.FOR_LEARNING)
     state, fingerprint = _Acting(opened.learners), configuration.fingerprint(config)
-    checkpoint.save(out / "checkpoints", state, opened.env_steps, fingerprint, {}, skip)
+    named = {name: array for name, array in checkpoint.arrays(state).items() if keeper.acts(name)}
+    checkpoint.save(out / "checkpoints", checkpoint.serialise(named), opened.env_steps, fingerprint, {})
     return out
 
 
-def _split(run: str) -> tuple[Path, int | None]:
-    kind, colon, name = run.partition(":")
-    if colon and kind == "pretrained":
+def _split(run: str) -> tuple[Path, int | None, str]:
+    """The folder that `RUN` names, the member of it, and which kind of checkpoint."""
+    kind = checkpoint.BEST if run.endswith("@best") and not Path(run).exists() else checkpoint.STEP
+    run = run.removesuffix("@best") if kind == checkpoint.BEST else run
+    origin, colon, name = run.partition(":")
+    if colon and origin == "pretrained":
         shipped = pretrained()
         if name not in shipped:
             raise UserError(configuration.unknown("pretrained policy", name, list(shipped)))
-        return shipped[name], None
+        return shipped[name], None, kind
     folder, at, member = run.rpartition("@")
     if at and member.isdigit() and not Path(run).exists():
-        return Path(folder), int(member)
-    return Path(run), None
+        return Path(folder), int(member), kind
+    return Path(run), None, kind
 
 
 class LoadedPolicy:

@@ -13,7 +13,9 @@ from rich.table import Table
 from rich.text import Text
 
 from gacrl.config import RunConfig
+from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.loop import Progress
+from gacrl.training.memory import readable
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Plan, Run, Watcher
 
@@ -75,8 +77,8 @@ class TerminalWatcher:
             f"{config.num_updates:,} updates, an evaluation every "
             f"{config.updates_per_chunk * config.steps_per_update:,} steps"
         )
-        memory = plan.bytes_per_seed * config.num_seeds / 2**20
-        say(f"memory     {memory:.1f} MiB for the training state, twice that while a chunk runs")
+        state = readable(plan.bytes_per_seed * config.num_seeds)
+        say(f"memory     {state} for the training state; {readable(plan.bytes_needed)} in all, at the least")
         if self._alive:
             self._live.start()
 
@@ -298,6 +300,24 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
             f"messages   {bits['bits_sent']:.2f} bits an agent and step; "
             f"{bits['bits_used_last_round']:.2f} in the last round's symbol, by how often each is sent"
         )
+
+
+def print_diagnosis(found: Diagnosis) -> None:
+    """The first bad update beside the one before it, and everything that is not finite after it."""
+    console, bad = _console(), found.bad
+    if bad is None:
+        console.print(f"every update from environment step {found.begun_at} to {found.ended_at} is finite")
+        return
+    console.print(
+        f"seed {bad.seed}: update {bad.update}, up to environment step {bad.env_steps}, is the first bad one",
+        soft_wrap=True,
+    )
+    table = Table("", "before", "then", box=box.SIMPLE_HEAD)
+    for name, (before, then) in bad.metrics.items():
+        table.add_row(name, "" if before is None else f"{before:.6g}", f"{then:.6g}")
+    console.print(table)
+    for name, value in bad.broken.items():
+        console.print(f"not finite {name}: {value}", soft_wrap=True)
 
 
 def _cell(mean: float | None, sd: float | None = None, digits: int = 2) -> str:

@@ -15,7 +15,7 @@ from gacrl.experiments import ablate
 from gacrl.experiments.ablate import FULL, METRICS, PARTS, SCORE, YOKED, plan
 from gacrl.experiments.study import DIVERGED, Planned
 from gacrl.training import session
-from gacrl.training.loop import Diverged
+from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
 

@@ -15,7 +15,7 @@ from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments.evidence import read_series
 from gacrl.experiments.study import DIVERGED, Planned, Watch, train_missing
 from gacrl.training import session
-from gacrl.training.loop import Diverged
+from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
 

@@ -81,7 +81,8 @@ def test_a_second_chunk_compiles_nothing_whatever_its_length(
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         for progress in train(trainer, config, trainer.init(config.seeds)):
             state = without_padding(progress.state, 2)
-            checkpoint.save(tmp_path, state, progress.env_steps, "", {})
+            tensors = checkpoint.serialise(checkpoint.arrays(state))
+            checkpoint.save(tmp_path, tensors, progress.env_steps, "", {})
             assert state.updates.tolist() == [progress.env_steps] * 2
             counts.append(len(compiled(caplog.records)))
             if len(counts) == 1:
@@ -368,7 +369,9 @@ def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
     )
     trainer = Trainer(algorithm, CLOSE, constant(), E, T)
     monkeypatch.setattr(trainer, "evaluate", lambda *how: {"return_agent_mean": np.zeros((1, 1))})
-    with pytest.raises(UserError, match=r"seed 0 diverged: loss is nan by environment step 6; .*smaller learning"):
+    with pytest.raises(
+        UserError, match=r"seed 0 diverged between environment steps 0 and 6: loss is nan; .*smaller learning"
+    ):
         next(train(trainer, config, trainer.init((0,))))
 
 

@@ -24,6 +24,7 @@ from gacrl.experiments.study import (
     Planned,
     Watch,
     claim_folder,
+    reading,
     refuse_other_settings,
     train_missing,
     why_diverged,
@@ -197,6 +198,11 @@ def _outcome(run: Planned) -> Outcome:
     because = why_diverged(run.folder)
     if because is not None:
         return Outcome(run.name, _num_parameters(run.config), {}, (), nothing, nothing, because)
+    with reading(run.folder):
+        return _read_outcome(run)
+
+
+def _read_outcome(run: Planned) -> Outcome:
     folder = RunFolder.open(run.folder)
     summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
     rows = folder.metrics()

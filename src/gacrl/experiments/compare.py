@@ -294,7 +294,7 @@ def _load(path: Path, warn: Warn) -> _Loaded:
         raise UserError(f"cannot read {error.filename}: {reason(error)}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"a file of {path} is damaged, it is not text: {error}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise UserError(f"{folder.summary_file} is damaged: {error}") from error
     if lines > len(rows):
         warn(f"the last line of {folder.metrics_file}, line {lines}, is cut off: compared without it")

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from gacrl.config import RunConfig
 from gacrl.envs.scripted import SCRIPTED
 from gacrl.experiments.paper_tables import reference_episodes
-from gacrl.experiments.study import why_diverged
+from gacrl.experiments.study import reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]
@@ -131,7 +131,12 @@ def blocks(episodes: Float[np.ndarray, " E"], size: int = FINAL_EPISODES) -> Flo
 
 
 def read_series(path: Path) -> Series:
-    """A finished run folder."""
+    """A finished run folder. Raises UserError for a damaged one."""
+    with reading(path):
+        return _read_series(path)
+
+
+def _read_series(path: Path) -> Series:
     folder = RunFolder.open(path)
     config, rows = folder.config(), folder.metrics()
     summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))

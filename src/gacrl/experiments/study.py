@@ -1,15 +1,18 @@
 """A folder of planned runs: it says what it is for, and a stopped study goes on with the runs that are missing."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.training import session
-from gacrl.training.loop import Diverged
+from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Run, Watcher
 
@@ -42,10 +45,21 @@ class Watch:
     say: Callable[[str], None] = lambda sentence: None
 
 
+@contextmanager
+def reading(folder: Path) -> Generator[None]:
+    """Raises UserError where what is read from a run of a study turns out to be damaged."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, RecursionError, OSError) as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"{folder} is damaged ({what}): remove that folder to train the run again") from error
+
+
 def why_diverged(folder: Path) -> str | None:
     """Why the run in that folder diverged; None for one that did not."""
     path = folder / DIVERGED
-    return json.loads(path.read_text(encoding="utf-8"))["because"] if path.is_file() else None
+    with reading(folder):
+        return str(json.loads(path.read_text(encoding="utf-8"))["because"]) if path.is_file() else None
 
 
 def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
@@ -62,6 +76,8 @@ def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
             text = json.dumps({"because": str(error).partition(";")[0]}) + "\n"
             (planned.folder / DIVERGED).write_text(text, encoding="utf-8")
             watch.finished(planned.name, "diverged")
+        finally:
+            jax.clear_caches()  # JAX keeps the programs of every run, some 90 MB, as long as the process lives
     return True
 
 

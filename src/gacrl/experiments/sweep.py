@@ -225,16 +225,16 @@ def _hyper(trainer: Trainer, point: Point) -> Any:
 
 
 def _read(out: Path) -> Scores:
-    """The results so far; a line that a crash cut off is left out."""
+    """The results so far; a line that a crash cut off, or that is no result, is left out and trained again."""
     scores: Scores = {}
     path = out / _RESULTS
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
         try:
             row = json.loads(line)
-        except ValueError:
+            point = Point(row["learning_rate"], row["epsilon"], row["temperature"])
+            scores[Member(point, row["seed"])] = float(row[SCORE])
+        except (ValueError, KeyError, TypeError, RecursionError):
             continue
-        point = Point(row["learning_rate"], row["epsilon"], row["temperature"])
-        scores[Member(point, row["seed"])] = row[SCORE]
     return scores
 
 

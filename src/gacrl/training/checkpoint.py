@@ -2,13 +2,16 @@
 
 A checkpoint is a folder `step-000000003750` with `state.safetensors` and `manifest.json` (format version,
 fingerprint of the configuration, counters, SHA-256 of the tensors and of all this). It is written under
-another name, synced to the disk, and renamed. No pickle, nothing that can run code.
+another name, synced to the disk, and renamed. No pickle, nothing that can run code. `best-000000003750` is
+another, of the policy alone, as it was when it scored best.
 """
 
+import contextlib
 import hashlib
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,13 +22,15 @@ import safetensors
 import safetensors.numpy
 from jaxtyping import PyTree
 
-from gacrl.errors import UserError
+from gacrl.errors import UserError, reason
 
 FORMAT_VERSION = 1
-KEPT = 2
-"""Newest checkpoints that stay; the one before the newest is there should the newest be damaged."""
+STEP, BEST = "step-", "best-"
+KEPT = {STEP: 2, BEST: 1}
+"""Newest of each kind that stay; of the whole states the one before is there should the newest be damaged."""
 
-_TENSORS, _MANIFEST, _PREFIX = "state.safetensors", "manifest.json", "step-"
+_TENSORS, _MANIFEST, _UNFINISHED, _DAMAGED = "state.safetensors", "manifest.json", ".unfinished-", ".damaged-"
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, RecursionError, safetensors.SafetensorError)
 Tree = TypeVar("Tree", bound=PyTree)
 
 
@@ -35,27 +40,35 @@ class Checkpoint(NamedTuple):
     folder: Path
     env_steps: int
     fingerprint: str
-    counters: dict[str, Any]
-    """What the host loop needs to go on: seconds spent so far."""
+    counters: dict[str, int | float]
+    """What the host loop needs to go on, such as seconds spent so far; of the best policy, its score."""
+
+
+def arrays(state: PyTree) -> dict[str, np.ndarray]:
+    """A state's leaves on the host, by their paths. They may be views: use them before the state is donated."""
+
+    def plain(leaf: jax.Array) -> np.ndarray:
+        if _is_key(leaf):
+            leaf = jax.random.key_data(leaf)
+        return np.asarray(leaf, order="C")
+
+    return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
+
+
+def serialise(named: Mapping[str, np.ndarray]) -> bytes:
+    """The file of these arrays: a copy, which no later step of the training changes."""
+    return safetensors.numpy.save(dict(named))
 
 
 def save(
-    folder: Path,
-    state: PyTree,
-    env_steps: int,
-    fingerprint: str,
-    counters: dict[str, Any],
-    skip: tuple[str, ...] = (),
+    folder: Path, tensors: bytes, env_steps: int, fingerprint: str, counters: dict[str, Any], kind: str = STEP
 ) -> Path:
-    """Write the state as the newest checkpoint in `folder` and drop the oldest beyond `KEPT`.
+    """Write serialised tensors as the newest checkpoint of this kind in `folder`, and drop those beyond `KEPT`.
 
-    skip: paths inside the state that are left out.
+    Raises OSError where it cannot be written; nothing of it is left then.
     """
-    target = folder / f"{_PREFIX}{env_steps:012d}"
-    unfinished = folder / f".unfinished-{target.name}"
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    tensors = safetensors.numpy.save(_to_arrays(state, skip))
+    target = folder / f"{kind}{env_steps:012d}"
+    unfinished = folder / f"{_UNFINISHED}{target.name}"
     manifest: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "env_steps": env_steps,
@@ -64,31 +77,48 @@ def save(
         "sha256": {_TENSORS: hashlib.sha256(tensors).hexdigest()},
     }
     manifest["checksum"] = _digest(manifest)
-    _write_synced(unfinished / _TENSORS, tensors)
-    _write_synced(unfinished / _MANIFEST, json.dumps(manifest, indent=2).encode())
-    _sync_folder(unfinished)
-    if target.exists():  # a run extended or replayed over the same step
-        shutil.rmtree(target)
-    unfinished.rename(target)
+    for left in folder.glob(f"{_UNFINISHED}*"):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    try:
+        unfinished.mkdir(parents=True)
+        _write_synced(unfinished / _TENSORS, tensors)
+        _write_synced(unfinished / _MANIFEST, json.dumps(manifest, indent=2).encode())
+        _sync_folder(unfinished)
+        if target.exists():  # a damaged one, which this training made anew
+            shutil.rmtree(target)
+        unfinished.rename(target)
+    except OSError:
+        shutil.rmtree(unfinished, ignore_errors=True)  # a full disk has no room for it
+        raise
     _sync_folder(folder)
-    for old in _folders(folder)[KEPT:]:
+    for old in _folders(folder, kind)[KEPT[kind] :]:
         shutil.rmtree(old, ignore_errors=True)
     return target
 
 
-def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
+def newest(folder: Path, kind: str = STEP) -> tuple[Checkpoint, list[str]]:
     """The newest intact checkpoint, and a sentence for each damaged one that was passed over.
 
     Raises UserError when there is none.
     """
     warnings: list[str] = []
-    for candidate in _folders(folder):
+    for candidate in _folders(folder, kind):
         try:
             return _inspect(candidate), warnings
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            warnings.append(f"checkpoint {candidate} is damaged ({error}); taking the one before it")
+        except _DAMAGE as error:
+            why = reason(error) if isinstance(error, OSError) else " ".join(str(error).split())
+            warnings.append(f"checkpoint {candidate} is damaged ({why}); taking the one before it")
     what = "is damaged" if warnings else "is missing"
     raise UserError(f"every checkpoint in {folder} {what}: train the run again into a new folder")
+
+
+def set_aside_after(folder: Path, env_steps: int) -> None:
+    """Rename the damaged checkpoints past a good one, so that they are not counted among those that stay."""
+    for damaged in _folders(folder, STEP):
+        if damaged.name > f"{STEP}{env_steps:012d}":
+            aside = folder / f"{_DAMAGED}{damaged.name}"
+            shutil.rmtree(aside, ignore_errors=True)
+            damaged.rename(aside)
 
 
 def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, ...] = ()) -> Tree:
@@ -111,7 +141,10 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
             name = prefix + inside
             is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
-            found = file.get_tensor(name) if name in saved else None
+            found = None
+            if name in saved:
+                with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
+                    found = file.get_tensor(name)
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
                 raise UserError(
@@ -124,35 +157,32 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
 
 
 def _inspect(folder: Path) -> Checkpoint:
-    """Read and verify a checkpoint; raises ValueError, KeyError, TypeError or OSError where it is damaged."""
+    """Read and verify a checkpoint; raises one of `_DAMAGE` where it is damaged."""
     manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
     if manifest["format_version"] != FORMAT_VERSION:
         raise ValueError(f"format version {manifest['format_version']}, this program reads {FORMAT_VERSION}")
     if manifest.pop("checksum") != _digest(manifest):
         raise ValueError(f"{_MANIFEST} does not match its checksum")
-    for name, digest in manifest["sha256"].items():
-        if hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
-            raise ValueError(f"{name} does not match its checksum")
-    return Checkpoint(folder, int(manifest["env_steps"]), manifest["fingerprint"], manifest["counters"])
+    env_steps, counters = manifest["env_steps"], manifest["counters"]
+    if type(env_steps) is not int or not 0 <= env_steps < 10**12:
+        raise ValueError(f"env_steps of {_MANIFEST} is {env_steps!r}")
+    if not isinstance(counters, dict) or any(type(value) not in (int, float) for value in counters.values()):
+        raise ValueError(f"counters of {_MANIFEST} are no numbers")
+    with (folder / _TENSORS).open("rb") as file:
+        if hashlib.file_digest(file, "sha256").hexdigest() != manifest["sha256"][_TENSORS]:
+            raise ValueError(f"{_TENSORS} does not match its checksum")
+    with safetensors.safe_open(str(folder / _TENSORS), "np"):
+        pass  # raises where it is no such file, whatever its checksum
+    return Checkpoint(folder, env_steps, str(manifest["fingerprint"]), counters)
 
 
 def _digest(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
-def _folders(folder: Path) -> list[Path]:
+def _folders(folder: Path, kind: str) -> list[Path]:
     """The checkpoints' folders, newest first."""
-    return sorted(folder.glob(f"{_PREFIX}*"), reverse=True) if folder.is_dir() else []
-
-
-def _to_arrays(state: PyTree, skip: tuple[str, ...]) -> dict[str, np.ndarray]:
-    def plain(leaf: jax.Array) -> np.ndarray:
-        if _is_key(leaf):
-            leaf = jax.random.key_data(leaf)
-        return np.asarray(leaf, order="C")
-
-    named = ((jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state))
-    return {name: plain(leaf) for name, leaf in named if not name.startswith(skip)}
+    return sorted(folder.glob(f"{kind}*"), reverse=True) if folder.is_dir() else []
 
 
 def _is_key(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:

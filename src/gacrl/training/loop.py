@@ -12,12 +12,8 @@ import jax
 import numpy as np
 
 from gacrl.config import RunConfig
-from gacrl.errors import UserError
+from gacrl.training.divergence import require_finite
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
-
-
-class Diverged(UserError):
-    """A loss is no longer a finite number."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ def train(
 ) -> Iterator[Progress]:
     """Train from a state (fresh, or of a checkpoint at `env_steps`) to the configured end.
 
-    Yields after every chunk. Raises Diverged as soon as a loss is not finite.
+    Yields after every chunk. Raises Diverged after the first one with a loss or a parameter that is not finite.
     """
     clock = Clock() if clock is None else clock
     per_update = config.steps_per_update
@@ -106,7 +102,8 @@ def train(
         rows = _rows(
             config, jax.device_get(report), trainer.metric_names, evaluations, done * per_update, finished, clock
         )
-        _require_finite(rows)
+        told = [row["update"] for row in rows]
+        require_finite(config.seeds, told, state.learner, (done - updates) * per_update, done * per_update)
         yield Progress(done * per_update, total * per_update, clock, rows, state)
 
 
@@ -156,13 +153,3 @@ def _difficulty(env_params: Any, member: int) -> dict[str, float]:
     """Those parameters of the task that a curriculum moves, where the task has them."""
     names = ("local_ratio", "coverage_threshold", "arena_scale", "landmark_speed")
     return {name: float(getattr(env_params, name)[member]) for name in names if hasattr(env_params, name)}
-
-
-def _require_finite(rows: tuple[dict[str, Any], ...]) -> None:
-    for row in rows:
-        for name, value in row["update"].items():
-            if not np.isfinite(value):
-                raise Diverged(
-                    f"seed {row['seed']} diverged: {name} is {value} by environment step {row['env_steps']}; "
-                    "the checkpoint before it is good, try a smaller learning rate"
-                )

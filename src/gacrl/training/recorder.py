@@ -99,23 +99,25 @@ class RunFolder:
 
         Raises UserError for a damaged line before the last, by its number.
         """
-        lines = self.metrics_file.read_text(encoding="utf-8").splitlines()
+        lines = self.metrics_file.read_bytes().splitlines()
         rows: list[dict[str, Any]] = []
         for number, line in enumerate(lines, start=1):
             try:
                 row = json.loads(line)
-                if not isinstance(row, dict):
-                    raise ValueError("it is not an object")
+                if not isinstance(row, dict) or type(row.get("env_steps")) is not int:
+                    raise ValueError("it is not an object with env_steps")
                 rows.append(row)  # pyright: ignore[reportUnknownArgumentType]
-            except ValueError as error:
+            except (ValueError, RecursionError) as error:
                 if number < len(lines):
                     raise UserError(f"line {number} of {self.metrics_file} is damaged: {error}") from error
         return rows
 
-    def forget_metrics_after(self, env_steps: int) -> None:
-        """Drop the rows past a checkpoint: the resumed run writes them again."""
-        rows = [row for row in self.metrics() if row["env_steps"] <= env_steps]
+    def forget_metrics_after(self, env_steps: int) -> int:
+        """Drop the rows past a checkpoint, which the resumed run writes again; returns how many stay."""
+        rows = self.metrics() if self.metrics_file.exists() else []
+        rows = [row for row in rows if row["env_steps"] <= env_steps]
         self._replace(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+        return len(rows)
 
     def extend(self, env_steps: int) -> None:
         """Set the planned environment steps anew; every other setting stays as it stands in the file."""

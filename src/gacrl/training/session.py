@@ -3,7 +3,7 @@
 import platform
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -23,11 +23,14 @@ from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
-from gacrl.training import checkpoint, curriculum
-from gacrl.training.devices import devices_for, one_seed, shard_seeds, without_padding
+from gacrl.training import checkpoint, curriculum, memory
+from gacrl.training.devices import devices_for, one_seed, shard_seeds
+from gacrl.training.divergence import Diverged
+from gacrl.training.keeper import FOR_LEARNING, ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.writer import Writer
 from gacrl.types import Learner
 
 SHOWN_EPISODES = 4
@@ -53,6 +56,8 @@ class Plan:
     """Numbers that a seed's network learns."""
     bytes_per_seed: int
     """Memory of a seed's training state (networks, optimiser, replay, environments)."""
+    bytes_needed: int
+    """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it."""
     devices: tuple[str, ...]
 
 
@@ -93,22 +98,28 @@ def evaluation_env(config: RunConfig) -> Spread:
 
 
 def plan(trainer: Trainer, config: RunConfig) -> Plan:
-    """Count what a run needs, without allocating it."""
-    member = _member_shapes(trainer)
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
+    """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
+    member, devices = _member_shapes(trainer), devices_for(config.num_seeds)
+    state, working = memory.size(member), memory.working_bytes(config, member)
+    needed = 2 * state * config.num_seeds + working * len(devices)
+    memory.require_room(needed, devices[0])
     network = getattr(member.learner, "network", ())
     return Plan(
         parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
-        bytes_per_seed=size,
-        devices=tuple(f"{device.platform}:{device.id}" for device in devices_for(config.num_seeds)),
+        bytes_per_seed=state,
+        bytes_needed=needed,
+        devices=tuple(f"{device.platform}:{device.id}" for device in devices),
     )
 
 
 def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
     """Train from the beginning, into a new run folder."""
+    watcher, trainer = watcher or Watcher(), build(config)
+    planned = plan(trainer, config)
     folder = RunFolder.create(out, config)
     with folder.locked():
-        return _run(folder, config, None, watcher or Watcher(), configuration.fingerprint(config))
+        watcher.planned(folder, config, planned)
+        return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config))
 
 
 def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
@@ -117,62 +128,97 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     folder = RunFolder.open(path)
     with folder.locked():
         config = folder.config()
-        fingerprint = configuration.fingerprint(folder.settings())
-        found: checkpoint.Checkpoint | None = None
-        if any(folder.checkpoints.glob("step-*")):
-            found, warnings = checkpoint.newest(folder.checkpoints)
-            for warning in warnings:
-                watcher.warn(warning)
-            if found.fingerprint != fingerprint:
-                raise UserError(
-                    f"{found.folder} was trained with other settings than {folder.config_file} now says: "
-                    "put the file back as it was, or train into a new folder"
-                )
+        found = newest_checkpoint(folder, watcher.warn)
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-            folder.extend(steps)
-        return _run(folder, config, found, watcher, fingerprint)
+        trainer = build(config)
+        planned = plan(trainer, config)
+        if found is not None:
+            checkpoint.set_aside_after(folder.checkpoints, found.env_steps)
+        if extend is not None:
+            folder.extend(config.training.env_steps)
+        watcher.planned(folder, config, planned)
+        fingerprint = configuration.fingerprint(folder.settings())
+        return _run(folder, config, trainer, found, watcher, fingerprint)
+
+
+def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
+    """Where a run can go on: at its newest intact checkpoint; None where it has not come to one yet.
+
+    Raises UserError for checkpoints that are all damaged or gone, or of other settings.
+    """
+    if not any(folder.checkpoints.glob(f"{checkpoint.STEP}*")):
+        rows = folder.metrics() if folder.metrics_file.exists() else []
+        if len({row["env_steps"] for row in rows}) > 1:  # an evaluation may be ahead of its checkpoint
+            raise UserError(
+                f"{folder.checkpoints} has lost its checkpoints: train the run again into a new folder"
+            )
+        return None
+    found, warnings = checkpoint.newest(folder.checkpoints)
+    for warning in warnings:
+        warn(warning)
+    if found.fingerprint != configuration.fingerprint(folder.settings()):
+        raise UserError(
+            f"{found.folder} was trained with other settings than {folder.config_file} now says: "
+            "put the file back as it was, or train into a new folder"
+        )
+    return found
+
+
+def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
+    """The training state of a checkpoint, laid out on the devices; a fresh one without."""
+    if found is None:
+        return trainer.init(config.seeds)
+    return shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
 
 
 def _run(
     folder: RunFolder,
     config: RunConfig,
+    trainer: Trainer,
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
 ) -> Run:
-    trainer = build(config)
-    watcher.planned(folder, config, plan(trainer, config))
+    env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
+    state = restore(trainer, config, found)
     try:
-        if found is None:
-            folder.forget_metrics_after(0)
-            env_steps, clock, state = 0, Clock(), trainer.init(config.seeds)
-        else:
-            folder.forget_metrics_after(found.env_steps)
-            env_steps, clock = found.env_steps, Clock(**found.counters)
-            state = shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
-        for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
-            env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-            folder.append_metrics(list(progress.rows))
-            checkpoint.save(
-                folder.checkpoints,
-                without_padding(state, config.num_seeds),
-                env_steps,
-                fingerprint,
-                vars(clock),
+        rows = folder.forget_metrics_after(env_steps)
+        if found is not None and rows != found.counters.get(ROWS, rows):
+            watcher.warn(
+                f"{folder.metrics_file} has {rows} of the {found.counters[ROWS]} lines that were written up to "
+                f"environment step {env_steps}: the others are lost, what follows is not"
             )
-            watcher.progress(progress)
-            if watcher.stop() and not progress.done:
-                return Run(folder.path, config, env_steps, None)
+        with Writer() as writer:
+            keep = Keeper(folder, config.num_seeds, fingerprint, writer, rows)
+            for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
+                env_steps, state, clock = progress.env_steps, progress.state, progress.clock
+                writer.wait()  # one evaluation at most is ahead of its checkpoint
+                folder.append_metrics(list(progress.rows))
+                keep(progress)
+                watcher.progress(progress)
+                if watcher.stop() and not progress.done:
+                    return Run(folder.path, config, env_steps, None)
         watcher.finishing()
         summary = _finish(folder, config, trainer, state, env_steps, clock)
+    except Diverged as error:
+        raise Diverged(
+            f"{error}, or see the first bad update with `gacrl resume {folder.path} --diagnose`, which begins at "
+            f"{'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
+        ) from error
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
             f"then `gacrl resume {folder.path}` goes on from the last checkpoint"
         ) from error
     return Run(folder.path, config, env_steps, summary)
+
+
+def _clock(found: checkpoint.Checkpoint) -> Clock:
+    """The clock as it stood at a checkpoint."""
+    known = asdict(Clock())
+    return Clock(**{name: value for name, value in found.counters.items() if name in known})  # pyright: ignore[reportArgumentType]
 
 
 def _finish(
@@ -208,6 +254,7 @@ def _finish(
     shown = episodes.record_many(
         env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
     )
+    folder.episodes.mkdir(exist_ok=True)
     for number, episode in enumerate(shown):
         episode.save(folder.episodes / f"{number}.npz")
     render.gif(shown, folder.gif, title=f"{config.preset}, seed {config.seed}")
@@ -251,10 +298,6 @@ def _member_shapes(trainer: Trainer) -> TrainState:
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
 
 
-FOR_LEARNING = (".replay", ".optimizer", ".rewards")
-"""What a learner holds that acting does not need."""
-
-
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = _stacked_shapes(trainer).learner
@@ -264,5 +307,6 @@ def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
 
 def _stacked_shapes(trainer: Trainer) -> TrainState:
     """The shapes of the training state of all seeds, as a checkpoint holds it."""
-    seeds = tuple(range(trainer.num_seeds))
-    return jax.eval_shape(lambda: trainer.init_stacked(seeds))
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((trainer.num_seeds, *leaf.shape), leaf.dtype), _member_shapes(trainer)
+    )

@@ -1,0 +1,51 @@
+"""Numbers that are no longer finite: seen at the end of every chunk, and traced to the first bad update."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gacrl.errors import UserError
+from gacrl.types import Learner
+
+
+class Diverged(UserError):
+    """A loss, or something that is learned, is no longer a finite number."""
+
+
+def not_finite(
+    seeds: Sequence[int], updates: Sequence[Mapping[str, Any]], learners: Learner
+) -> Iterator[tuple[int, str, str]]:
+    """The seed, name and value of whatever is NaN or infinite: what the updates told of each seed, then its learner.
+
+    learners: stacked over the seeds; gradients show in the optimiser's moments.
+    """
+    for seed, metrics in zip(seeds, updates, strict=True):
+        yield from ((seed, name, str(value)) for name, value in metrics.items() if not np.isfinite(value))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(learners):
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            continue
+        values = np.asarray(leaf)
+        if np.isfinite(values).all():
+            continue
+        name = jax.tree_util.keystr(path).lstrip(".")
+        for seed, member in zip(seeds, values, strict=False):  # a last one may be repeated, as padding
+            bad = member[~np.isfinite(member)]
+            if bad.size:
+                yield seed, name, f"{bad[0]} in {bad.size} of {member.size} places"
+
+
+def require_finite(
+    seeds: Sequence[int], updates: Sequence[Mapping[str, Any]], learners: Learner, before: int, after: int
+) -> None:
+    """Raises Diverged with the first quantity that is not finite.
+
+    before, after: the environment steps between which it happened.
+    """
+    for seed, name, value in not_finite(seeds, updates, learners):
+        raise Diverged(
+            f"seed {seed} diverged between environment steps {before} and {after}: {name} is {value}; "
+            "try a smaller learning rate"
+        )

@@ -1,0 +1,507 @@
+"""What a run survives: kills while it writes, full and read-only disks, damage, a clock that jumps back, divergence."""
+
+import contextlib
+import functools
+import json
+import os
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import TinyRun
+
+from gacrl import config as configuration
+from gacrl import play
+from gacrl.algorithms.algorithm import Algorithm
+from gacrl.cli import main
+from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.errors import UserError
+from gacrl.experiments import paper_tables
+from gacrl.training import checkpoint, session
+from gacrl.training.divergence import Diverged, not_finite
+from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Watcher
+from gacrl.training.trainer import Trainer
+from gacrl.training.writer import Writer
+from gacrl.types import Decision
+
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+
+BUILD = session.build
+TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def traced_once() -> Iterator[None]:
+    """A run that is gone on with has the trainer that it had: nothing is traced again. And nothing is drawn."""
+    kept = functools.cache(BUILD)
+
+    def build(config: RunConfig) -> Any:
+        return kept(
+            replace(config, training=replace(config.training, env_steps=450))
+        )  # of no matter to the paper's
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "build", build)
+        patch.setattr(session.episodes, "record_many", lambda *_: [])
+        patch.setattr(session.render, "gif", lambda *_, **__: None)
+        patch.setattr(paper_tables, "table_2", lambda *_: [])
+        patch.setattr(paper_tables, "table_3", lambda *_: [])
+        yield
+
+
+@pytest.fixture
+def copy(tiny_run: TinyRun, tmp_path: Path) -> Path:
+    """The tiny run, 450 steps, to be spoilt."""
+    return Path(shutil.copytree(tiny_run.folder, tmp_path / "copy"))
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Runs a command: its exit code, and what it printed as errors."""
+
+    def run(*words: object) -> tuple[int, str]:
+        capsys.readouterr()
+        code = main([str(word) for word in words])
+        return code, capsys.readouterr().err
+
+    return run
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    """Every line of the metrics, without the times that no two runs share."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [{name: value for name, value in json.loads(line).items() if name not in TIMES} for line in lines]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def assert_same_end(folder: Path, other: Path) -> None:
+    assert rows(folder) == rows(other)
+    newest = [max(path.glob("checkpoints/step-*")) / "state.safetensors" for path in (folder, other)]
+    assert newest[0].read_bytes() == newest[1].read_bytes()
+    summaries = [json.loads((path / "summary.json").read_text()) for path in (folder, other)]
+    assert summaries[0]["final"] == summaries[1]["final"]
+
+
+# Kills.
+
+WRITER = """
+import json, os, random, signal, sys, time
+from pathlib import Path
+import numpy as np
+from gacrl.training import checkpoint
+from gacrl.training.recorder import RunFolder
+
+folder, kills, chance = RunFolder(Path(sys.argv[1])), int(sys.argv[2]), random.Random(0)
+folder.checkpoints.mkdir(parents=True)
+folder.metrics_file.touch()
+
+def tensors(step):
+    return checkpoint.serialise({"numbers": np.random.default_rng(step).normal(size=50_000)})
+
+def write_on(done):
+    with folder.locked():  # of the process before, which died with it
+        assert folder.forget_metrics_after(done) == done
+        while True:
+            done += 1
+            folder.append_metrics([{"env_steps": done}])
+            checkpoint.save(folder.checkpoints, tensors(done), done, "", {"rows": done})
+
+begun = time.perf_counter()
+checkpoint.save(folder.checkpoints, tensors(0), 0, "", {})
+pace = time.perf_counter() - begun
+torn = done = 0
+for _ in range(kills):
+    child = os.fork()
+    if child == 0:
+        write_on(done)
+    time.sleep(chance.uniform(0, 4 * pace))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    torn += any(folder.checkpoints.glob(".unfinished*"))
+    before = done
+    found, damaged = checkpoint.newest(folder.checkpoints)
+    assert not damaged
+    assert (found.folder / "state.safetensors").read_bytes() == tensors(found.env_steps)
+    done = found.env_steps
+    steps = [row["env_steps"] for row in folder.metrics()]
+    assert before <= done <= len(steps) <= done + 1, (before, done, steps)
+    assert steps == list(range(1, len(steps) + 1)), "none missing, none twice"
+print(json.dumps({"done": done, "torn": torn}))
+"""
+
+
+def test_nothing_is_lost_however_often_a_writer_is_killed(tmp_path: Path):
+    """kill -9 at fifty random moments of a process that does nothing but write."""
+    words = [sys.executable, "-c", WRITER, str(tmp_path / "run"), "50"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["done"] >= 5, "it goes on between the kills"
+    assert found["torn"] >= 5, "and some of them hit a checkpoint half written"
+
+
+def test_a_stop_by_the_system_ends_in_a_checkpoint(
+    copy: Path, tiny_run: TinyRun, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+):
+    """SIGTERM in the middle of a chunk: exit 143. (SIGINT: test_resume.py.)"""
+    real = RunFolder.append_metrics
+
+    def terminated(self: RunFolder, rows: list[dict[str, Any]]) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        real(self, rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "append_metrics", terminated)
+        assert said("resume", copy, "--extend", 120) == (143, "")
+    assert checkpoint.newest(copy / "checkpoints")[0].env_steps == 510
+    assert said("resume", copy) == (0, "")
+    assert [row["env_steps"] for row in rows(copy)][::2] == [*range(60, 450, 60), 450, 510, 570]
+
+
+# The background.
+
+
+def test_training_goes_on_while_a_checkpoint_is_written():
+    writing, disk, written = threading.Event(), threading.Event(), []
+
+    def slow(number: int) -> None:
+        writing.set()
+        assert disk.wait(60)
+        written.append(number)
+
+    with Writer() as writer:
+        writer.submit(lambda: slow(1))
+        assert writing.wait(60)
+        assert written == [], "nobody waits for the disk"
+        disk.set()
+        writer.submit(lambda: slow(2))
+        assert written[:1] == [1], "but for the write before"
+    assert written == [1, 2], "and at the end"
+
+
+def fail() -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_an_error_of_the_background_comes_to_the_front():
+    with pytest.raises(OSError, match="No space"), Writer() as writer:
+        writer.submit(fail)
+    with Writer() as writer:
+        writer.submit(fail)
+        with pytest.raises(OSError, match="No space"):
+            writer.submit(lambda: None)
+        writer.submit(lambda: None)
+    with pytest.raises(KeyboardInterrupt), Writer() as writer:
+        writer.submit(fail)
+        raise KeyboardInterrupt
+
+
+# Disks.
+
+
+def test_a_disk_without_room_loses_nothing(copy: Path, said: Callable[..., tuple[int, str]]):
+    """A true limit on the size of files, which binds any user: the checkpoint does not fit, and then does."""
+    before, limits = content(copy), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        code, sentence = said("resume", copy, "--extend", 60)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2
+    assert sentence.startswith(f"gacrl: cannot write to {copy}: File too large; make room there")
+    assert sentence.count("\n") == 1
+    after = content(copy)
+    assert {name: after[name] for name in before if name.startswith("checkpoints")} == {
+        name: data for name, data in before.items() if name.startswith("checkpoints")
+    }
+    assert after["metrics.jsonl"].startswith(before["metrics.jsonl"])
+    assert not any(copy.glob("checkpoints/.unfinished*")), "a full disk gets its room back"
+    assert said("resume", copy) == (0, "")
+    assert [row["env_steps"] for row in rows(copy)][::2] == [*range(60, 450, 60), 450, 510]
+
+
+@contextlib.contextmanager
+def nobody() -> Iterator[None]:
+    """As a user whom permissions bind: root is not."""
+    if os.geteuid():
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_a_folder_that_may_not_be_written(tiny_run: TinyRun, said: Callable[..., tuple[int, str]]):
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(shutil.copytree(tiny_run.folder, Path(made) / "run"))
+        (folder / ".lock").unlink(missing_ok=True)
+        for path in (Path(made), *folder.rglob("*"), folder):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        before = content(folder)
+        with nobody():
+            code, sentence = said("resume", folder, "--extend", 60)
+            started, why = said("train", *tiny_run.words, "--out", Path(made) / "new")
+        assert (code, sentence) == (2, f"gacrl: cannot use {folder}/.lock: Permission denied\n")
+        assert started == 2
+        assert (
+            why == f"gacrl: cannot write the run folder {made}/new: Permission denied; choose another with --out\n"
+        )
+        assert content(folder) == before
+        for path in (Path(made), folder, *folder.rglob("*")):
+            path.chmod(0o755)
+
+
+# Damage.
+
+
+@pytest.mark.parametrize("damage", ["flipped", "cut off"])
+def test_a_damaged_checkpoint_costs_a_chunk_and_no_bit(
+    damage: str,
+    copy: Path,
+    tiny_run: TinyRun,
+    said: Callable[..., tuple[int, str]],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The one before it is taken, and says so; beside it a lock that somebody left, and a clock that jumps back."""
+    newest = copy / "checkpoints/step-000000000450"
+    data = bytearray((newest / "state.safetensors").read_bytes())
+    data[len(data) // 2] ^= 1
+    (newest / "state.safetensors").write_bytes(data if damage == "flipped" else data[: len(data) // 2])
+    (copy / "summary.json").unlink()
+    (copy / ".lock").write_text("999999999\n")
+    past = iter(range(2_000_000_000, 0, -3600))
+    monkeypatch.setattr(time, "time", lambda: float(next(past)))
+    for k, path in enumerate(sorted(copy.rglob("*"))):
+        os.utime(path, (4_000_000_000 - 86_400 * k,) * 2)
+
+    code, sentence = said("resume", copy)
+    assert code == 0
+    assert sentence == (
+        f"gacrl: checkpoint {newest} is damaged (state.safetensors does not match its checksum); "
+        "taking the one before it\n"
+    )
+    assert_same_end(copy, tiny_run.folder)
+    assert (copy / "checkpoints/.damaged-step-000000000450").is_dir(), "it is out of the way, and not thrown away"
+    assert said("resume", copy) == (0, "")
+
+
+def test_evaluations_that_are_gone_are_told(copy: Path, said: Callable[..., tuple[int, str]]):
+    lines = (copy / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (copy / "metrics.jsonl").write_text("".join(lines[4:]))
+    code, sentence = said("resume", copy)
+    assert code == 0
+    assert sentence.startswith(f"gacrl: {copy / 'metrics.jsonl'} has 12 of the 16 lines that were written up to")
+
+    shutil.rmtree(copy / "checkpoints")
+    before = content(copy)
+    code, sentence = said("resume", copy)
+    assert (code, content(copy)) == (2, before)
+    assert (
+        sentence
+        == f"gacrl: {copy / 'checkpoints'} has lost its checkpoints: train the run again into a new folder\n"
+    )
+
+
+# The network.
+
+
+def test_nothing_is_fetched(copy: Path, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch):
+    """Training, its closing evaluation, and playing, without a network. (A process from its first line: test_resume.py.)"""
+
+    def offline(*address: Any) -> None:
+        raise AssertionError(f"the network is asked for {address}")
+
+    for name in ("connect", "connect_ex", "sendto"):
+        monkeypatch.setattr(socket.socket, name, offline)
+    for name in ("getaddrinfo", "gethostbyname", "create_connection"):
+        monkeypatch.setattr(socket, name, offline)
+    assert said("resume", copy, "--extend", 60) == (0, "")
+    assert said("evaluate", copy, "--episodes", 8) == (0, "")
+
+
+# The best.
+
+
+def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path):
+    """Its parameters are those of the step that it names, and `RUN@best` has them."""
+    (best,) = (copy / "checkpoints").glob("best-*")
+    returns: dict[int, list[float]] = {}
+    for row in rows(copy):
+        returns.setdefault(row["env_steps"], []).append(row["greedy"]["return_agent_mean"])
+    means = {steps: float(np.mean(values)) for steps, values in returns.items()}
+    found, _ = checkpoint.newest(copy / "checkpoints", checkpoint.BEST)
+    assert found.folder == best
+    assert found.env_steps == max(means, key=lambda steps: means[steps])
+    assert found.counters == {"return_agent_mean": means[found.env_steps]}
+    assert best.joinpath("state.safetensors").stat().st_size < 0.5 * max(
+        path.stat().st_size for path in copy.glob("checkpoints/step-*/state.safetensors")
+    ), "no replay and no optimiser"
+
+    config = RunFolder(copy).config()
+    trainer = session.build(config)
+    learners = session.load_learners(found, trainer)
+    played = trainer.evaluate(learners, False, "monitor", config.evaluation.num_episodes)
+    np.testing.assert_array_equal(
+        np.float32([values.mean() for values in jax.device_get(played["return_agent_mean"])]),
+        np.float32(returns[found.env_steps]),
+    )
+    opened = play.open_run(f"{copy}@1@best")
+    assert opened.env_steps == found.env_steps
+    for here, there in zip(
+        jax.tree.leaves(opened.learners.network), jax.tree.leaves(learners.network), strict=True
+    ):
+        np.testing.assert_array_equal(here[0], np.asarray(there)[1])
+
+
+# Divergence.
+
+
+class Weights(NamedTuple):
+    network: Any
+    updates: Any
+
+
+def breaking(at: int, loss: float) -> Algorithm:
+    """Agents that stand still, and whose weights are broken by one update; the loss is finite up to then."""
+
+    def policy(learner: Weights, explore: bool) -> Any:
+        return lambda memory, observation, key, channel: (Decision(jnp.zeros(3, jnp.int32)), memory)
+
+    def init(key: Any, hyper: Any) -> Weights:
+        return Weights({"layer": jnp.ones((2, 3))}, jnp.zeros((), jnp.int32))
+
+    def update(learner: Weights, rollout: Any, key: Any) -> tuple[Weights, Any]:
+        updates = learner.updates + 1
+        layer = learner.network["layer"].at[1, 2].add(jnp.where(updates >= at, jnp.inf, 0.5))
+        return Weights({"layer": layer}, updates), {"loss": jnp.where(updates >= at, loss, updates * 1.0)}
+
+    return Algorithm(init, lambda num_agents: (), policy, update, hyper=())
+
+
+SHORT = RunConfig(
+    env=replace(configuration.preset("paper").env, max_cycles=4),
+    training=TrainingConfig(env_steps=60, num_envs=2, num_steps=3),
+    evaluation=EvaluationConfig(interval=18, num_episodes=2, final_episodes=2),
+    seed=7,
+)
+"""Ten updates, three to a chunk."""
+
+
+def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The loss stays finite: it is a parameter, of the fifth update, that is not."""
+    folder = tmp_path / "run"
+    monkeypatch.setattr(session.algorithms, "make", lambda *_: breaking(at=5, loss=2.0))
+    monkeypatch.setattr(session, "build", functools.cache(BUILD))
+    monkeypatch.setattr(Trainer, "evaluate", lambda *_: {"return_agent_mean": np.zeros((1, 2))})
+    with pytest.raises(Diverged) as stopped:
+        session.start(SHORT, folder)
+    assert str(stopped.value) == (
+        "seed 7 diverged between environment steps 18 and 36: network['layer'] is inf in 1 of 6 places; try a smaller "
+        f"learning rate, or see the first bad update with `gacrl resume {folder} --diagnose`, which begins at the last "
+        "good checkpoint, of environment step 18"
+    )
+    assert [row["env_steps"] for row in rows(folder)] == [18]
+    assert [path.name for path in folder.glob("checkpoints/step-*")] == ["step-000000000018"]
+
+    before = content(folder)
+    assert main(["resume", str(folder), "--diagnose", "--json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert json.loads(lines[-1]) == {
+        "begun_at": 18,
+        "ended_at": 30,
+        "bad": {
+            "seed": 7,
+            "update": 5,
+            "env_steps": 30,
+            "metrics": {"loss": [4.0, 2.0]},
+            "broken": {"network['layer']": "inf in 1 of 6 places"},
+        },
+    }
+    assert "seed 7: update 5, up to environment step 30, is the first bad one" in lines
+    assert content(folder) == before, "nothing is written"
+
+
+def test_what_is_not_finite_is_named():
+    learners = {"w": jnp.array([[1.0, 2.0], [jnp.nan, -jnp.inf]]), "n": jnp.array([[1], [2]])}
+    found = list(not_finite((3, 4), [{"loss": 1.0}, {"loss": float("inf")}], learners))
+    assert found == [(4, "loss", "inf"), (4, "['w']", "nan in 2 of 2 places")]
+    assert list(not_finite((3,), [{"loss": 1.0}], {"w": learners["w"]})) == [], (
+        "a repeated member is not looked at"
+    )
+
+
+# Memory.
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--algorithm.replay-capacity 10000000 --training.num-envs 100000 --num-seeds 100",
+        "--preset mappo --training.num-steps 1000000 --training.num-envs 1000",
+        "--preset paper --algorithm.batch-size 1000000 --env.num-agents 3000",
+        "--preset ippo --algorithm.network.width 65536 --algorithm.network.depth 9",
+        "--preset mappo --env.num-agents 10000",
+        "--preset qmix --evaluation.final-episodes 100000 --env.num-agents 500",
+    ],
+)
+def test_what_cannot_fit_is_refused_with_the_number(
+    words: str, tmp_path: Path, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(session, "build", BUILD)
+    monkeypatch.setattr(session.memory, "memory_of", lambda device: 16 * 2**30)
+    out = tmp_path / "run"
+    before = int(Path("/proc/self/statm").read_text().split()[1])
+    code, sentence = said("train", *words.split(), "--out", out)
+    assert code == 2
+    assert sentence.startswith("gacrl: this run needs at least ")
+    needed, unit = sentence.split("at least ")[1].split(" of memory")[0].split(" ")
+    assert float(needed.replace(",", "")) > 16 or unit != "GiB"
+    assert "and cpu:0 has 16.0 GiB" in sentence
+    assert not out.exists()
+    grown = (int(Path("/proc/self/statm").read_text().split()[1]) - before) * resource.getpagesize()
+    assert grown < 2**30, "nothing large was allocated to find out"
+
+
+def test_the_plan_of_a_run_counts_its_replay():
+    config = configuration.preset("gacrl")
+    trainer = BUILD(config)
+    planned = session.plan(trainer, config)
+    member = jax.eval_shape(lambda: trainer.init_stacked((0,)))
+    state = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
+    assert planned.bytes_per_seed == state
+    assert planned.bytes_per_seed > 150_000 * 4 * 100
+    assert 2 * state < planned.bytes_needed < 2.5 * state
+
+
+def test_a_watcher_is_told_of_damage(copy: Path):
+    """Also from Python, where nothing is printed."""
+    (copy / "checkpoints/step-000000000450/manifest.json").write_text("[" * 100_000)
+    told: list[str] = []
+    session.resume(copy, watcher=Watcher(warn=told.append))
+    assert len(told) == 1
+    assert "is damaged (maximum recursion depth exceeded" in told[0]
+    with pytest.raises(UserError, match="is missing"):
+        checkpoint.newest(copy / "nowhere")
