@@ -18,6 +18,31 @@ Arguments = TypeVar("Arguments")
 
 
 @dataclass(frozen=True)
+class Cluster:
+    """Several processes as one: each is started with the same command."""
+
+    distributed: bool = False
+    """Be one of several processes (docs/guides/cluster.md); SLURM, Open MPI, Kubernetes or JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID say which, or these three:"""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, with --distributed."""
+    num_processes: int | None = None
+    """How many there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+    wait: int = 120
+    """Seconds to wait for the others."""
+
+    def check(self) -> None:
+        """Raises UserError where half of it is said."""
+        given = [self.coordinator, self.num_processes, self.process_id]
+        if not self.distributed and given != [None] * 3:
+            raise UserError("--coordinator, --num-processes and --process-id need --distributed")
+        if self.wait < 1:
+            raise UserError(f"--wait must be at least 1 second, not {self.wait}")
+
+
+@dataclass(frozen=True)
 class Train:
     """Train, with a live progress line, and write a run folder.
 
@@ -39,6 +64,7 @@ class Train:
     """The same, counted in episodes."""
     out: Path | None = None
     """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
 
@@ -56,6 +82,7 @@ class Resume:
     """A run folder."""
     extend: int | None = None
     """Environment steps to train past the planned end."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
 

@@ -17,6 +17,7 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
+    from gacrl.arguments import Cluster
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.reproduce import Reproduction
     from gacrl.experiments.study import Watch
@@ -91,12 +92,11 @@ def _train(words: list[str]) -> int:
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def start(watcher: "Watcher") -> "Run":
-        from gacrl.training import devices, session
+        from gacrl.training import session
 
-        devices.prepare_jax(config.num_seeds)
         return session.start(config, asked.out, watcher)
 
-    return _watched(start, asked.json)
+    return _watched(start, asked.json, config, asked.cluster)
 
 
 def _resume(words: list[str]) -> int:
@@ -105,24 +105,39 @@ def _resume(words: list[str]) -> int:
     asked = arguments.parse(arguments.Resume, words, "resume")
     if asked.extend is not None and asked.extend < 1:
         raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
+    from gacrl.training import recorder
+
+    config = recorder.RunFolder.open(asked.run).config()
+    if asked.extend is not None:
+        env_steps = config.training.env_steps + asked.extend
+        config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def resume(watcher: "Watcher") -> "Run":
-        from gacrl.training import devices, recorder, session
+        from gacrl.training import session
 
-        devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
         return session.resume(asked.run, asked.extend, watcher)
 
-    return _watched(resume, asked.json)
+    return _watched(resume, asked.json, config, asked.cluster)
 
 
-def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
+def _watched(work: Callable[["Watcher"], "Run"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
+    cluster.check()
     from gacrl.progress import TerminalWatcher
+    from gacrl.training import devices, distributed
 
-    with TerminalWatcher() as terminal, _stopping(terminal):
-        run = work(terminal.watcher())
+    place = distributed.ALONE
+    if cluster.distributed:
+        place = distributed.find_place(cluster.coordinator, cluster.num_processes, cluster.process_id)
+    devices.prepare_jax(-(-config.num_seeds // place.count))
+    with (
+        TerminalWatcher(quiet=place.process > 0) as terminal,
+        _stopping(terminal),
+        distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
+    ):
+        run = work(watcher)
     terminal.report(run)
-    if as_json:
+    if as_json and not terminal.quiet:
         print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
     return 0 if run.summary is not None else terminal.exit_code
 

@@ -1,16 +1,22 @@
-"""How this machine is used: its devices, the compilation cache, and independent seeds side by side."""
+"""How this machine is used: devices, the compilation cache, independent seeds side by side, several processes."""
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
+
+from gacrl.algorithms.shared import ENVS
+from gacrl.errors import UserError
 
 _CACHE_BYTES = 512 * 2**20
 """Bound of the compilation cache; the oldest programs go first."""
@@ -49,9 +55,45 @@ def compiler_options() -> dict[str, str]:
     return {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"} if tested else {}
 
 
-def devices_for(num_seeds: int) -> list[Any]:
-    """As many devices as can be kept busy by this many seeds."""
-    return jax.local_devices()[: min(num_seeds, jax.local_device_count())]
+def mesh_for(num_seeds: int, num_envs: int | None = None) -> Mesh:
+    """The devices of all processes, as many as can be kept busy, with the axes `seeds` and `envs`.
+
+    num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; on one CPU
+    that does not pay and is not done. Raises UserError where some process would have nothing to do.
+    """
+    if jax.process_count() == 1:
+        return _mesh_of_one_process(num_seeds, num_envs)
+    seeds, envs, devices = _shares(num_seeds, num_envs)
+    if seeds > num_seeds and num_seeds < jax.process_count():
+        raise UserError(
+            f"{jax.process_count()} processes cannot share {num_seeds} seeds of an algorithm that learns from replay: "
+            f"give --num-seeds {jax.process_count()} or more, start fewer processes, or take a PPO preset"
+        )
+    if num_envs is not None and num_envs % envs:
+        raise UserError(
+            f"training.num_envs {num_envs} cannot be shared evenly by the {envs} devices of a seed: make it a multiple"
+        )
+    return Mesh(np.asarray(devices).reshape(seeds, envs), ("seeds", ENVS))
+
+
+def _mesh_of_one_process(num_seeds: int, num_envs: int | None) -> Mesh:
+    seeds, envs, devices = _shares(num_seeds, num_envs)
+    if envs > 1 and (num_envs or 1) % envs:
+        seeds, envs = min(num_seeds, len(devices)), 1
+    return Mesh(np.asarray(devices[: seeds * envs]).reshape(seeds, envs), ("seeds", ENVS))
+
+
+def _shares(num_seeds: int, num_envs: int | None) -> tuple[int, int, list[Any]]:
+    """How many groups of seeds, how many devices for each, and the devices, those of a process side by side."""
+    local = Counter(device.process_index for device in jax.devices())
+    each = min(local.values())
+    if num_envs is None or jax.default_backend() == "cpu":
+        each = min(each, -(-num_seeds // len(local)))
+    devices = [device for k in sorted(local) for device in jax.local_devices(k)[:each]]
+    if num_envs is None or num_seeds >= len(devices):
+        return len(devices), 1, devices
+    seeds = max(count for count in range(1, num_seeds + 1) if len(devices) % count == 0)
+    return seeds, len(devices) // seeds, devices
 
 
 def stack_seeds(members: list[PyTree]) -> PyTree:
@@ -59,16 +101,54 @@ def stack_seeds(members: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
 
-def shard_seeds(stacked: PyTree, num_seeds: int) -> PyTree:
-    """A stacked pytree laid out on the devices.
+def shard_seeds(stacked: PyTree, num_seeds: int, mesh: Mesh) -> PyTree:
+    """A stacked pytree laid out on the devices; with several processes each has the whole of it to begin with.
 
     Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
     """
-    devices = devices_for(num_seeds)
-    members = jnp.minimum(jnp.arange(num_seeds + -num_seeds % len(devices)), num_seeds - 1)
-    mesh = Mesh(np.asarray(devices), ("seeds",))
-    padded = jax.tree.map(lambda leaf: leaf[members], stacked)
-    return jax.device_put(padded, NamedSharding(mesh, PartitionSpec("seeds")))
+    members = jnp.minimum(jnp.arange(num_seeds + -num_seeds % mesh.shape["seeds"]), num_seeds - 1)
+    layout = NamedSharding(mesh, PartitionSpec("seeds"))
+    return jax.tree.map(lambda leaf: _laid_out(leaf[members], layout), stacked)
+
+
+def _laid_out(leaf: jax.Array, layout: NamedSharding) -> jax.Array:
+    if layout.is_fully_addressable:
+        return jax.device_put(leaf, layout)
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_laid_out(jax.random.key_data(leaf), layout))
+    rows = np.asarray(leaf)
+    return jax.make_array_from_callback(rows.shape, layout, lambda index: rows[index])
+
+
+def gathered(tree: PyTree) -> PyTree:
+    """What is spread over several processes, whole in each of them; all must call it. Anything else as it is."""
+    leaves = jax.tree.leaves(tree)
+    if all(leaf.is_fully_addressable for leaf in leaves):
+        return tree
+    whole = _gathering(leaves[0].sharding.mesh)(tree)
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), whole)
+
+
+@cache
+def _gathering(mesh: Mesh) -> Callable[[PyTree], PyTree]:
+    return jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def leads() -> bool:
+    """Whether this process writes: one of several does."""
+    return jax.process_index() == 0
+
+
+def anyone(yes: bool) -> bool:
+    """Whether any of the processes says yes; all must ask."""
+    return yes if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.asarray(yes)).any())
+
+
+def same_everywhere(number: int) -> bool:
+    """Whether all processes have the same number; all must ask, and none goes on before all have."""
+    if jax.process_count() == 1:
+        return True
+    return len(set(multihost_utils.process_allgather(np.asarray(number)).tolist())) == 1
 
 
 def one_seed(stacked: PyTree, member: int) -> PyTree:
@@ -91,7 +171,8 @@ def _rows(leaf: Any, start: int, stop: int) -> jax.Array:
     if not isinstance(leaf, jax.Array) or len(leaf.sharding.device_set) == 1:
         return jax.device_put(leaf[start:stop], home)
     parts: list[jax.Array] = []
-    for shard in sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start or 0):
+    shards = [shard for shard in leaf.addressable_shards if shard.replica_id == 0]
+    for shard in sorted(shards, key=lambda shard: shard.index[0].start or 0):
         first = shard.index[0].start or 0
         wanted = slice(max(start - first, 0), max(stop - first, 0))
         if wanted.start < min(wanted.stop, shard.data.shape[0]):
@@ -99,14 +180,13 @@ def _rows(leaf: Any, start: int, stop: int) -> jax.Array:
     return jnp.concatenate(parts)
 
 
-def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
+def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     """`function(member, *shared)` for one seed, as a function of the stacked seeds.
 
     Seeds are sharded over the devices. Within one device they take turns: on a CPU, mapping them instead makes
-    every small matrix product a batch of them, and gains nothing (docs/design.md).
+    every small matrix product a batch of them, and gains nothing (docs/design.md). What is within a seed is left to
+    the compiler to spread over the axis `envs`, as `algorithms.shared.share_out` asks.
     """
-    devices = devices_for(num_seeds)
-    mesh = Mesh(np.asarray(devices), ("seeds",))
 
     def on_one_device(stacked: PyTree, *shared: PyTree) -> PyTree:
         if jax.tree.leaves(stacked)[0].shape[0] == 1:
@@ -117,15 +197,19 @@ def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any
         return jax.lax.map(lambda member: function(member, *shared), stacked)
 
     def on_all_devices(stacked: PyTree, *shared: PyTree) -> PyTree:
-        if len(devices) == 1:
+        if mesh.size == 1:
             return on_one_device(stacked, *shared)
         seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
-        return jax.shard_map(
+        mapped = jax.shard_map(
             on_one_device,
             mesh=mesh,
             in_specs=(seeds, *[everywhere] * len(shared)),
             out_specs=seeds,
+            axis_names={"seeds"} if mesh.shape[ENVS] > 1 else set(mesh.axis_names),
             check_vma=False,
         )(stacked, *shared)
+        if mesh.shape[ENVS] == 1:
+            return mapped
+        return jax.lax.with_sharding_constraint(mapped, NamedSharding(mesh, seeds))
 
     return on_all_devices

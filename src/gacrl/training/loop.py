@@ -13,6 +13,7 @@ import numpy as np
 
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
+from gacrl.training.devices import gathered
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
 
@@ -97,15 +98,13 @@ def train(
             "greedy": trainer.evaluate(state.learner, False, "monitor", config.evaluation.num_episodes),
             "sampled": trainer.evaluate(state.learner, True, "monitor", config.evaluation.num_episodes),
         }
-        evaluations = jax.device_get(evaluations)
+        evaluations = jax.device_get(gathered(evaluations))
         if first:  # compiling is nearly all of the first evaluation
             compiling += time.perf_counter() - begun
         wall = before.wall + time.perf_counter() - started
         clock = Clock(wall, training, compiling, timed)
-        finished = jax.device_get(state.episodes)
-        rows = _rows(
-            config, jax.device_get(report), trainer.metric_names, evaluations, done * per_update, finished, clock
-        )
+        report, finished = jax.device_get(gathered((report, state.episodes)))
+        rows = _rows(config, report, trainer.metric_names, evaluations, done * per_update, finished, clock)
         _require_finite(rows)
         yield Progress(done * per_update, total * per_update, clock, rows, state)
 

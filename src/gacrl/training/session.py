@@ -3,6 +3,7 @@
 import platform
 import subprocess
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
@@ -11,9 +12,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from gacrl import config as configuration
 from gacrl import envs, render
+from gacrl.algorithm_config import PpoConfig
 from gacrl.algorithms import algorithm as algorithms
 from gacrl.config import RunConfig
 from gacrl.envs import scripted
@@ -23,7 +26,16 @@ from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint, curriculum
-from gacrl.training.devices import devices_for, one_seed, shard_seeds, without_padding
+from gacrl.training.devices import (
+    anyone,
+    gathered,
+    leads,
+    mesh_for,
+    one_seed,
+    same_everywhere,
+    shard_seeds,
+    without_padding,
+)
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
@@ -78,6 +90,14 @@ def build(config: RunConfig) -> Trainer:
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,
         evaluation_env=evaluation_env(config),
+        mesh=mesh(config),
+    )
+
+
+def mesh(config: RunConfig) -> Mesh:
+    """The devices that train this configuration: PPO learns from environments that are spread over several."""
+    return mesh_for(
+        config.num_seeds, config.training.num_envs if isinstance(config.algorithm, PpoConfig) else None
     )
 
 
@@ -95,14 +115,15 @@ def plan(trainer: Trainer, config: RunConfig) -> Plan:
     return Plan(
         parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
         bytes_per_seed=size,
-        devices=tuple(f"{device.platform}:{device.id}" for device in devices_for(config.num_seeds)),
+        devices=tuple(f"{device.platform}:{device.id}" for device in trainer.mesh.devices.flat),
     )
 
 
 def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
     """Train from the beginning, into a new run folder."""
-    folder = RunFolder.create(out, config)
-    with folder.locked():
+    mesh(config)  # refuses, before there is a folder, what the devices cannot share
+    folder = RunFolder.create(out, config) if leads() else RunFolder(out or Path("runs"))
+    with folder.locked() if leads() else nullcontext():
         return _run(folder, config, None, watcher or Watcher(), configuration.fingerprint(config))
 
 
@@ -110,7 +131,8 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
     watcher = watcher or Watcher()
     folder = RunFolder.open(path)
-    with folder.locked():
+    mesh(folder.config())
+    with folder.locked() if leads() else nullcontext():
         config = folder.config()
         fingerprint = configuration.fingerprint(folder.settings())
         found: checkpoint.Checkpoint | None = None
@@ -123,10 +145,13 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
                     f"{found.folder} was trained with other settings than {folder.config_file} now says: "
                     "put the file back as it was, or train into a new folder"
                 )
+        if not same_everywhere(-1 if found is None else found.env_steps):
+            raise UserError(f"the processes see different checkpoints in {folder.path}: put it where all share it")
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-            folder.extend(steps)
+            if leads():
+                folder.extend(steps)
         return _run(folder, config, found, watcher, fingerprint)
 
 
@@ -140,25 +165,22 @@ def _run(
     trainer = build(config)
     watcher.planned(folder, config, plan(trainer, config))
     try:
+        if leads():
+            folder.forget_metrics_after(0 if found is None else found.env_steps)
         if found is None:
-            folder.forget_metrics_after(0)
             env_steps, clock, state = 0, Clock(), trainer.init(config.seeds)
         else:
-            folder.forget_metrics_after(found.env_steps)
             env_steps, clock = found.env_steps, Clock(**found.counters)
-            state = shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
+            saved = checkpoint.load(found, _stacked_shapes(trainer))
+            state = shard_seeds(saved, config.num_seeds, trainer.mesh)
         for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
             env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-            folder.append_metrics(list(progress.rows))
-            checkpoint.save(
-                folder.checkpoints,
-                without_padding(state, config.num_seeds),
-                env_steps,
-                fingerprint,
-                vars(clock),
-            )
+            whole = without_padding(gathered(state), config.num_seeds)
+            if leads():
+                folder.append_metrics(list(progress.rows))
+                checkpoint.save(folder.checkpoints, whole, env_steps, fingerprint, vars(clock))
             watcher.progress(progress)
-            if watcher.stop() and not progress.done:
+            if anyone(watcher.stop()) and not progress.done:
                 return Run(folder.path, config, env_steps, None)
         watcher.finishing()
         summary = _finish(folder, config, trainer, state, env_steps, clock)
@@ -177,7 +199,7 @@ def _finish(
     num_episodes = config.evaluation.final_episodes
     env = evaluation_env(config)
     final = {
-        kind: jax.device_get(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes))
+        kind: jax.device_get(gathered(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes)))
         for kind in ("greedy", "sampled")
     }
     references = evaluate_scripted(env, num_episodes)
@@ -198,8 +220,11 @@ def _finish(
         "wall_seconds": clock.wall,
         "versions": versions(),
     }
+    learner = one_seed(gathered(state.learner), 0)
+    if not leads():
+        return summary
     folder.write_summary(summary)
-    policy = trainer.algorithm.policy(one_seed(state.learner, 0), False)
+    policy = trainer.algorithm.policy(learner, False)
     shown = episodes.record_many(
         env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
     )
@@ -254,7 +279,7 @@ def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = _stacked_shapes(trainer).learner
     learners = checkpoint.load(found, shapes, prefix=".learner", skip=FOR_LEARNING)
-    return shard_seeds(learners, trainer.num_seeds)
+    return shard_seeds(learners, trainer.num_seeds, trainer.mesh)
 
 
 def _stacked_shapes(trainer: Trainer) -> TrainState:
