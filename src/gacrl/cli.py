@@ -17,9 +17,10 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
-    from gacrl.arguments import Cluster
+    from gacrl.arguments import Cluster, Sweep
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.reproduce import Reproduction
+    from gacrl.experiments.search import Search
     from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher, TerminalWatcher
     from gacrl.training.session import Run, Watcher
@@ -36,7 +37,7 @@ usage: gacrl COMMAND [OPTIONS]
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
-  sweep      the paper's grid of settings, and the spread that chance alone makes
+  sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -261,7 +262,9 @@ def _reproduce(words: list[str]) -> int:
     return _studied(study, asked.out, asked.json)
 
 
-def _studied(study: Callable[["Watch"], "Ablation | Reproduction | None"], out: Path, as_json: bool) -> int:
+def _studied(
+    study: Callable[["Watch"], "Ablation | Reproduction | Search | None"], out: Path, as_json: bool
+) -> int:
     """Make a study of many runs under the eyes of the terminal; Ctrl-C ends as in training."""
     from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher
@@ -297,17 +300,45 @@ def _sweep(words: list[str]) -> int:
     from gacrl import arguments
 
     asked = arguments.parse(arguments.Sweep, words, "sweep")
+    out = asked.out or Path("runs") / Path(asked.spec).stem
+    if asked.spec != "paper-grid":
+        return _search(asked, out)
+    if asked.ray is not None:
+        raise UserError("paper-grid is one compiled program and needs no cluster: leave --ray out")
+    seeds = 2 if asked.seeds is None else asked.seeds
     from gacrl.training.devices import prepare_jax
 
-    prepare_jax(27 * max(asked.seeds, 1))
+    prepare_jax(27 * max(seeds, 1))
     from gacrl.experiments import sweep
 
-    grid = sweep.paper_grid(asked.seeds, asked.episodes)
-    done = sweep.sweep(grid, asked.out, say=lambda line: print(line, flush=True))
+    grid = sweep.paper_grid(seeds, 500 if asked.episodes is None else asked.episodes)
+    done = sweep.sweep(grid, out, say=lambda line: print(line, flush=True))
     print(f"report     {done.report}")
     if asked.json:
         print(json.dumps(done.to_dict()))
     return 0
+
+
+def _search(asked: "Sweep", out: Path) -> int:
+    """A search that a file describes, here or on a cluster."""
+    if asked.seeds is not None or asked.episodes is not None:
+        raise UserError(f"--seeds and --episodes are for paper-grid: say seeds and env_steps in {asked.spec}")
+    if asked.trial_cpus <= 0 or asked.trial_gpus < 0:
+        raise UserError("--trial-cpus must be above 0, and --trial-gpus not below it")
+    from gacrl.experiments import search
+    from gacrl.training.devices import prepare_jax
+
+    spec = search.load(Path(asked.spec))
+    prepare_jax(spec.config.num_seeds)
+
+    def study(watch: "Watch") -> "search.Search | None":
+        if asked.ray is None:
+            return search.search(spec, out, watch)
+        from gacrl.experiments.ray_search import ray_search
+
+        return ray_search(spec, out, asked.ray, asked.trial_cpus, asked.trial_gpus, watch)
+
+    return _studied(study, out, asked.json)
 
 
 def _presets(words: list[str]) -> int:

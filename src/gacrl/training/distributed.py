@@ -103,13 +103,13 @@ def joined(place: Place, settings: str, seconds: float, watcher: Watcher) -> Gen
 
 def _planned(peers: Peers, watcher: Watcher, folder: RunFolder, config: RunConfig, plan: Plan) -> None:
     if peers.place.process == 0:
-        go_on = f"go on from the last checkpoint with `gacrl resume {folder.path}`"
-        peers.mend = lambda: f"{_newest(folder)}{go_on}"
-        peers.tell(go_on)
+        peers.mend = lambda: _mend(folder)
+        peers.tell(f"go on with `gacrl resume {folder.path}`")
     watcher.planned(folder, config, plan)
 
 
-def _newest(folder: RunFolder) -> str:
-    """The last checkpoint by name; whether it is whole is seen when it is read."""
-    found = sorted(path.name for path in folder.checkpoints.glob("step-*"))
-    return f"its last checkpoint is {found[-1]}; " if found else "it has no checkpoint yet; "
+def _mend(folder: RunFolder) -> str:
+    """Names the last checkpoint; whether it is whole is seen when it is read."""
+    found = sorted(folder.checkpoints.glob("step-*"))
+    last = f"the last checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
+    return f"{last}; go on with `gacrl resume {folder.path}`"
