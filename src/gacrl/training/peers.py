@@ -58,6 +58,7 @@ class Line:
         return words if isinstance(words, dict) else None  # pyright: ignore[reportUnknownVariableType]
 
     def close(self) -> None:
+        self._reader.close()
         self._connection.close()
 
 
@@ -140,7 +141,7 @@ def _gather(place: Place, settings: str, seconds: float) -> Peers:
                     f"{seconds:g} s: {missing}; start them, or give --num-processes as there are"
                 )
             hello = line.hear(_HELLO_SECONDS)
-            if hello is None or "process" not in hello:  # someone else knocked at this port
+            if hello is None or not isinstance(hello.get("process"), int):  # someone else knocked at this port
                 line.close()
                 continue
             other, problem = hello["process"], _problem(hello, place, settings, lines)
