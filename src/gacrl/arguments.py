@@ -267,9 +267,9 @@ class Sweep:
     """A TOML file, or paper-grid."""
     ray: str | None = None
     """HOST:PORT of a Ray cluster's head, or auto."""
-    trial_cpus: float = 1
+    trial_cpus: float = 1.0
     """CPU cores that a trial takes, with --ray."""
-    trial_gpus: float = 0
+    trial_gpus: float = 0.0
     """And GPUs."""
     seeds: int | None = None
     """Seeds of each point of paper-grid; none: 2."""

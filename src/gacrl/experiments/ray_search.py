@@ -38,7 +38,7 @@ try:
     from ray.tune.schedulers import ASHAScheduler  # pyright: ignore[reportMissingImports]
     from ray.tune.search.optuna import OptunaSearch  # pyright: ignore[reportMissingImports]
 except ImportError as error:
-    raise UserError(f"--ray needs {error.name}: pip install 'gacrl[ray]'") from error
+    raise UserError("--ray needs Ray and Optuna: pip install 'gacrl[ray]'") from error
 
 _REDUCTION = 3
 """Of the trials that reach a rung the best third goes on; rungs are at 1/9 and 1/3 of the planned steps."""
@@ -52,6 +52,7 @@ def ray_search(spec: Spec, out: Path, address: str, cpus: float, gpus: float, wa
 
     address: HOST:PORT of the cluster's head, or `auto`. cpus, gpus: what a trial takes. Raises UserError.
     """
+    _require_cluster(address)
     out = out.resolve()
     search.claim(spec, out, "Optuna")
     watch.planned([])
@@ -72,18 +73,22 @@ def ray_search(spec: Spec, out: Path, address: str, cpus: float, gpus: float, wa
     return search.conclude(spec, out)
 
 
-def _connect(address: str) -> None:
+def _require_cluster(address: str) -> None:
     """Raises UserError where no cluster answers; Ray itself would try for minutes, and then end the process."""
+    if address == "auto":
+        return
     host, _, port = address.rpartition(":")
-    if address != "auto":
-        if not host or not port.isdigit() or not 0 < int(port) < 65_536:
-            raise UserError(f"--ray must be HOST:PORT of the cluster's head, or auto, not {address!r}")
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), _REACHABLE_SECONDS).close()
-        except OSError as error:
-            raise UserError(
-                f"no Ray cluster answers at {address} ({error}): is `ray start --head` running?"
-            ) from error
+    if not host or not port.isdigit() or not 0 < int(port) < 65_536:
+        raise UserError(f"--ray must be HOST:PORT of the cluster's head, or auto, not {address!r}")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _REACHABLE_SECONDS).close()
+    except OSError as error:
+        raise UserError(
+            f"no Ray cluster answers at {address} ({error}): is `ray start --head` running?"
+        ) from error
+
+
+def _connect(address: str) -> None:
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, RuntimeError) as error:

@@ -238,7 +238,7 @@ def search(spec: Spec, out: Path, watch: Watch) -> Search | None:
 def proposals(spec: Spec) -> list[dict[str, Any]]:
     """Values that fill the ranges evenly, each once; the first of many are those of few."""
     shares = qmc.Halton(len(spec.searched), rng=spec.config.seed).random(16 * spec.trials)
-    points = [{one.setting: one.at(s) for one, s in zip(spec.searched, row, strict=True)} for row in shares]
+    points = [{one.setting: one.at(float(s)) for one, s in zip(spec.searched, row, strict=True)} for row in shares]
     distinct = {json.dumps(point): point for point in points}
     return list(distinct.values())[: spec.trials]
 
