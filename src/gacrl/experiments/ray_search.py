@@ -96,7 +96,7 @@ def _connect(address: str) -> None:
         raise UserError(f"cannot join the Ray cluster at {address}: {first}") from error
 
 
-class _Follower(tune.Callback, tune.Stopper):
+class _Follower(tune.Callback, tune.Stopper):  # pyright: ignore[reportUntypedBaseClass]
     """What Tune does, told, and noted in the trials' folders; and the wish to stop."""
 
     def __init__(self, spec: Spec, out: Path, say: Callable[[str], None], stopping: Callable[[], bool]):

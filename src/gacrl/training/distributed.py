@@ -54,7 +54,9 @@ def find_place(
         raise UserError(f"--num-processes must be at least 1, not {count}")
     if not 0 <= process < count:
         raise UserError(f"--process-id must be between 0 and {count - 1} of {count} processes, not {process}")
-    return Place(process, count, host.strip("[]"), int(port), local_devices and tuple(local_devices))
+    return Place(
+        process, count, host.strip("[]"), int(port), None if local_devices is None else tuple(local_devices)
+    )
 
 
 def _number(name: str) -> int | None:

@@ -13,7 +13,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, NoReturn
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
 from gacrl.errors import UserError
 
@@ -22,7 +23,8 @@ _PROBES = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 _HELLO_SECONDS = 5.0
 
 
-class Place(NamedTuple):
+@dataclass(frozen=True)
+class Place:
     """Which process of a job this is, and where they meet."""
 
     process: int
