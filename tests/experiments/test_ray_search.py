@@ -53,10 +53,10 @@ class Cluster:
         own = ["--temp-dir", str(self.folder), "--include-dashboard", "false"] if node == HEAD else []
         ray = [sys.executable, "-m", "ray.scripts.scripts", "start", *where, *own]
         words = [*ray, "--node-ip-address", node, "--num-cpus", "1", "--disable-usage-stats", "--block"]
-        log = (self.folder / f"{node}.log").open("ab")
-        self.nodes[node] = subprocess.Popen(
-            words, env=self.environment, stdout=log, stderr=log, start_new_session=True
-        )
+        with (self.folder / f"{node}.log").open("ab") as log:
+            self.nodes[node] = subprocess.Popen(
+                words, env=self.environment, stdout=log, stderr=log, start_new_session=True
+            )
         end = time.monotonic() + 120
         while len(self.alive()) < len(self.nodes):
             assert time.monotonic() < end, (self.folder / f"{node}.log").read_text()
@@ -180,7 +180,7 @@ def test_a_cluster_that_is_not_there_is_refused_at_once(
     address: str, sentence: str, file: Path, tmp_path: Path, quick_start: dict[str, str]
 ):
     words = [sys.executable, "-m", "gacrl", "sweep", str(file), "--ray", address, "--out", str(tmp_path / "out")]
-    done = subprocess.run(words, env=quick_start, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(words, env=quick_start, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
     assert done.stderr.startswith(f"gacrl: {sentence}")
     assert done.stderr.count("\n") == 1

@@ -53,7 +53,7 @@ class Job:
         where = ("--distributed", "--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", count)
         return [self.start("-m", "gacrl", *words, *where, "--process-id", k) for k in range(count)]
 
-    def finish(self, code: int = 0, seconds: float = 300) -> list[str]:
+    def finish(self, code: int = 0, seconds: float = 900) -> list[str]:
         """What each said; all must end like that, in this time."""
         said = [child.communicate(timeout=seconds)[0] for child in self.running]
         assert [child.returncode for child in self.running] == [code] * len(said), "\n".join(said)

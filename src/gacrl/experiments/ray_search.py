@@ -164,7 +164,7 @@ def _proposer(spec: Spec, mode: str, tried: list[search.Trial]) -> Any:
         space={one.setting: _distribution(one) for one in spec.searched},
         metric=spec.metric,
         mode=mode,
-        sampler=optuna.samplers.TPESampler(seed=spec.config.seed),
+        sampler=optuna.samplers.TPESampler(seed=spec.config.seed + len(tried)),  # else it proposes the same again
         points_to_evaluate=[encoded(spec, trial.values) for trial in tried if trial.state == "unfinished"] or None,
     )
     for trial in tried:

@@ -53,7 +53,8 @@ class Run:
     config: RunConfig
     env_steps: int
     summary: dict[str, Any] | None
-    """The content of `summary.json`; None where the run was stopped before its end."""
+    """The content of `summary.json`; None where the run was stopped before its end. Empty in processes that do not
+    write."""
 
 
 @dataclass(frozen=True)
@@ -175,9 +176,10 @@ def _run(
             state = shard_seeds(saved, config.num_seeds, trainer.mesh)
         for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
             env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-            whole = without_padding(gathered(state), config.num_seeds)
+            everything = gathered(state)
             if leads():
                 folder.append_metrics(list(progress.rows))
+                whole = without_padding(everything, config.num_seeds)
                 checkpoint.save(folder.checkpoints, whole, env_steps, fingerprint, vars(clock))
             watcher.progress(progress)
             if anyone(watcher.stop()) and not progress.done:
@@ -202,6 +204,9 @@ def _finish(
         kind: jax.device_get(gathered(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes)))
         for kind in ("greedy", "sampled")
     }
+    learner = one_seed(gathered(state.learner), 0)
+    if not leads():
+        return {}
     references = evaluate_scripted(env, num_episodes)
     members = len(config.seeds)
     summary = {
@@ -220,9 +225,6 @@ def _finish(
         "wall_seconds": clock.wall,
         "versions": versions(),
     }
-    learner = one_seed(gathered(state.learner), 0)
-    if not leads():
-        return summary
     folder.write_summary(summary)
     policy = trainer.algorithm.policy(learner, False)
     shown = episodes.record_many(
