@@ -30,7 +30,7 @@ class Cluster:
     """How many there are."""
     process_id: int | None = None
     """Which of them this is, from 0."""
-    wait: int = 120
+    wait: float = 120.0
     """Seconds to wait for the others."""
 
     def check(self) -> None:
@@ -39,7 +39,7 @@ class Cluster:
         if not self.distributed and given != [None] * 3:
             raise UserError("--coordinator, --num-processes and --process-id need --distributed")
         if self.wait < 1:
-            raise UserError(f"--wait must be at least 1 second, not {self.wait}")
+            raise UserError(f"--wait must be at least 1 second, not {self.wait:g}")
 
 
 @dataclass(frozen=True)

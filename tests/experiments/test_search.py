@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,14 @@ def test_trials_fill_the_ranges(file: Path):
     assert more[:6] == points, "a longer search begins as the shorter one"
     other = proposals(search.load(_changed(file, "seed = 3", "seed = 4")))
     assert other != points
+
+
+def test_the_example_of_the_guide_is_a_search(tmp_path: Path):
+    guide = Path(__file__).parents[2] / "docs/guides/cluster.md"
+    (tmp_path / "guide.toml").write_text(guide.read_text(encoding="utf-8").split("```toml\n")[1].split("```")[0])
+    spec = search.load(tmp_path / "guide.toml")
+    assert spec.config.training == replace(configuration.preset("ippo").training, num_envs=32, env_steps=500_000)
+    assert [one.kind for one in spec.searched] == ["log", "uniform", "integer", "choice"]
 
 
 def test_the_ends_of_ranges():

@@ -63,7 +63,7 @@ def main(names: str, out: str, devices: str, where: str = "", count: str = "1", 
     jax.config.update("jax_num_cpu_devices", int(devices))
     place = distributed.find_place(where, int(count), int(process)) if where else distributed.ALONE
     seeds = int(devices) * place.count
-    with distributed.joined(place, "", 60, Watcher()):
+    with distributed.joined(place, "", 120.0, Watcher()):
         for name in names.split(","):
             config = configs(seeds)[name]
             trainer = session.build(config)

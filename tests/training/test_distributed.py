@@ -143,9 +143,11 @@ def tensors(folder: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("count", "victim"), [(2, 1), (2, 0), (4, 2)])
-def test_a_process_that_dies_ends_the_job_and_others_go_on(job: Job, tmp_path: Path, count: int, victim: int):
-    """Within 5 s, with a sentence; the checkpoint is good; one process, or three, finish the run."""
+@pytest.mark.parametrize(("count", "victim", "then"), [(2, 1, 3), (2, 0, 1), (4, 2, 2)])
+def test_a_process_that_dies_ends_the_job_and_others_go_on(
+    job: Job, tmp_path: Path, count: int, victim: int, then: int
+):
+    """Within 5 s, with a sentence; the checkpoint is good; another number of processes finishes the run."""
     folder = tmp_path / "run"
     running = job.together(count, "train", *TINY, "--env-steps", 100_000, "--out", folder)
     wait_for_lines(job, folder, 8)
@@ -168,7 +170,7 @@ def test_a_process_that_dies_ends_the_job_and_others_go_on(job: Job, tmp_path: P
         config = json.loads((path / "config.json").read_text())
         config["training"]["env_steps"] = reached + 60  # as if it had been planned so
         (path / "config.json").write_text(json.dumps(config))
-    job.together(3 if count == 2 else 2, "resume", folder)
+    job.together(then, "resume", folder)
     job.finish()
     assert main(["resume", str(tmp_path / "straight")]) == 0
     assert (folder / "summary.json").is_file()

@@ -58,8 +58,8 @@ def compiler_options() -> dict[str, str]:
 def mesh_for(num_seeds: int, num_envs: int | None = None) -> Mesh:
     """The devices of all processes, as many as can be kept busy, with the axes `seeds` and `envs`.
 
-    num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; on one CPU
-    that does not pay and is not done. Raises UserError where some process would have nothing to do.
+    num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; one process
+    on a CPU leaves them together. Raises UserError where some process would have nothing to do.
     """
     if jax.process_count() == 1:
         return _mesh_of_one_process(num_seeds, num_envs)
