@@ -160,6 +160,7 @@ def test_a_process_that_dies_ends_the_job_and_others_go_on(
         assert child.returncode != 0
         assert f"gacrl: process {victim} of {count} has died, and with it the job" in words
         assert f"go on with `gacrl resume {folder}`" in words
+    running[victim].communicate()
     job.running.clear()
 
     reached = checkpoint.newest(folder / "checkpoints")[0].env_steps
