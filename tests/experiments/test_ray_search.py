@@ -165,7 +165,8 @@ def test_a_node_and_a_driver_die_and_no_finished_trial_is_lost(cluster: Cluster,
     assert all(name in said or name in before for name in (trial["name"] for trial in trials))
 
     again = drive(cluster, file, out)
-    assert again.wait(timeout=120) == 0
+    said = again.communicate(timeout=300)[0]
+    assert again.returncode == 0, said
     assert finished(out) == after
 
 
