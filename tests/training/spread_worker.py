@@ -51,8 +51,10 @@ def on_mesh(config: RunConfig, devices: np.ndarray) -> Trainer:
 def after_ten_updates(trainer: Trainer, config: RunConfig) -> dict[str, np.ndarray]:
     """Every number of the training state."""
     state, _ = jax.block_until_ready(trainer.chunk(trainer.init(config.seeds), UPDATES))
-    whole = without_padding(gathered(state), config.num_seeds)
-    return {jax.tree_util.keystr(path): _plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(whole)}
+    whole = gathered(state)
+    assert without_padding(whole.updates, config.num_seeds).tolist() == [UPDATES] * config.num_seeds
+    leaves = jax.tree_util.tree_leaves_with_path(whole)
+    return {jax.tree_util.keystr(path): _plain(leaf)[: config.num_seeds] for path, leaf in leaves}
 
 
 def _plain(leaf: Any) -> np.ndarray:

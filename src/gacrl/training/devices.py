@@ -61,25 +61,20 @@ def mesh_for(num_seeds: int, num_envs: int | None = None) -> Mesh:
     num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; one process
     on a CPU leaves them together. Raises UserError where some process would have nothing to do.
     """
-    if jax.process_count() == 1:
-        return _mesh_of_one_process(num_seeds, num_envs)
     seeds, envs, devices = _shares(num_seeds, num_envs)
-    if seeds > num_seeds and num_seeds < jax.process_count():
+    uneven = num_envs is not None and num_envs % envs > 0
+    if jax.process_count() == 1:
+        if uneven:
+            seeds, envs = min(num_seeds, len(devices)), 1
+    elif num_envs is None and num_seeds < jax.process_count():
         raise UserError(
             f"{jax.process_count()} processes cannot share {num_seeds} seeds of an algorithm that learns from replay: "
             f"give --num-seeds {jax.process_count()} or more, start fewer processes, or take a PPO preset"
         )
-    if num_envs is not None and num_envs % envs:
+    elif uneven:
         raise UserError(
             f"training.num_envs {num_envs} cannot be shared evenly by the {envs} devices of a seed: make it a multiple"
         )
-    return Mesh(np.asarray(devices).reshape(seeds, envs), ("seeds", ENVS))
-
-
-def _mesh_of_one_process(num_seeds: int, num_envs: int | None) -> Mesh:
-    seeds, envs, devices = _shares(num_seeds, num_envs)
-    if envs > 1 and (num_envs or 1) % envs:
-        seeds, envs = min(num_seeds, len(devices)), 1
     return Mesh(np.asarray(devices[: seeds * envs]).reshape(seeds, envs), ("seeds", ENVS))
 
 
@@ -108,12 +103,14 @@ def shard_seeds(stacked: PyTree, num_seeds: int, mesh: Mesh) -> PyTree:
     """
     members = jnp.minimum(jnp.arange(num_seeds + -num_seeds % mesh.shape["seeds"]), num_seeds - 1)
     layout = NamedSharding(mesh, PartitionSpec("seeds"))
-    return jax.tree.map(lambda leaf: _laid_out(leaf[members], layout), stacked)
+    padded = jax.tree.map(lambda leaf: leaf[members], stacked)
+    if layout.is_fully_addressable:
+        return jax.device_put(padded, layout)
+    return jax.tree.map(lambda leaf: _laid_out(leaf, layout), padded)
 
 
 def _laid_out(leaf: jax.Array, layout: NamedSharding) -> jax.Array:
-    if layout.is_fully_addressable:
-        return jax.device_put(leaf, layout)
+    """This process's rows of what all have; `device_put` would compare the whole of it among them first."""
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_laid_out(jax.random.key_data(leaf), layout))
     rows = np.asarray(leaf)
