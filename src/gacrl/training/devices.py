@@ -119,9 +119,9 @@ def _laid_out(leaf: jax.Array, layout: NamedSharding) -> jax.Array:
 
 def gathered(tree: PyTree) -> PyTree:
     """What is spread over several processes, whole in each of them; all must call it. Anything else as it is."""
-    leaves = jax.tree.leaves(tree)
-    if all(leaf.is_fully_addressable for leaf in leaves):
+    if jax.process_count() == 1:
         return tree
+    leaves = jax.tree.leaves(tree)
     whole = _gathering(leaves[0].sharding.mesh)(tree)
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), whole)
 
