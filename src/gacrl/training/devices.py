@@ -121,6 +121,7 @@ def gathered(tree: PyTree) -> PyTree:
     """What is spread over several processes, whole in each of them; all must call it. Anything else as it is."""
     if jax.process_count() == 1:
         return tree
+    wait_for_all()
     leaves = jax.tree.leaves(tree)
     whole = _gathering(leaves[0].sharding.mesh)(tree)
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), whole)
@@ -139,6 +140,15 @@ def leads() -> bool:
 def anyone(yes: bool) -> bool:
     """Whether any of the processes says yes; all must ask."""
     return yes if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.asarray(yes)).any())
+
+
+def wait_for_all() -> None:
+    """Go on when all processes are here.
+
+    gloo gives processes 30 s between the first and the last to set up what they need for a new computation, less than
+    compiling may take; for one that is set up it waits as long as it must. This one is set up when a process joins.
+    """
+    anyone(False)
 
 
 def same_everywhere(number: int) -> bool:

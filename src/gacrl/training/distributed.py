@@ -16,6 +16,7 @@ import jax
 
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
+from gacrl.training.devices import wait_for_all
 from gacrl.training.peers import Peers, Place, meet
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Plan, Watcher
@@ -90,6 +91,7 @@ def joined(place: Place, settings: str, seconds: float, watcher: Watcher) -> Gen
             cluster_detection_method="deactivate",
             initialization_timeout=int(seconds),
         )
+        wait_for_all()
         yield replace(watcher, planned=lambda *planned: _planned(peers, watcher, *planned))
         peers.leave()
         jax.distributed.shutdown()

@@ -13,7 +13,7 @@ import numpy as np
 
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
-from gacrl.training.devices import gathered
+from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
 
@@ -87,6 +87,7 @@ def train(
             begun = time.perf_counter()
             chunk = trainer.chunk.lower(state, updates).compile()
             compiling += time.perf_counter() - begun
+            wait_for_all()
         begun = time.perf_counter()
         state, report = jax.block_until_ready(chunk(state, updates))
         training += time.perf_counter() - begun
