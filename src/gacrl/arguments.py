@@ -18,6 +18,31 @@ Arguments = TypeVar("Arguments")
 
 
 @dataclass(frozen=True)
+class Cluster:
+    """Several processes as one: each is started with the same command."""
+
+    distributed: bool = False
+    """Be one of several processes (docs/guides/cluster.md); SLURM, Open MPI, Kubernetes or JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID say which, or these three:"""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, with --distributed."""
+    num_processes: int | None = None
+    """How many there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+    wait: float = 120.0
+    """Seconds to wait for the others."""
+
+    def check(self) -> None:
+        """Raises UserError where half of it is said."""
+        given = [self.coordinator, self.num_processes, self.process_id]
+        if not self.distributed and given != [None] * 3:
+            raise UserError("--coordinator, --num-processes and --process-id need --distributed")
+        if self.wait < 1:
+            raise UserError(f"--wait must be at least 1 second, not {self.wait:g}")
+
+
+@dataclass(frozen=True)
 class Train:
     """Train, with a live progress line, and write a run folder.
 
@@ -39,6 +64,7 @@ class Train:
     """The same, counted in episodes."""
     out: Path | None = None
     """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
 
@@ -60,6 +86,7 @@ class Resume:
     diagnose: bool = False
     """Play what follows the newest checkpoint again, one update at a time, and print the first that is not finite;
     nothing is written."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
 
@@ -227,23 +254,34 @@ class Ablate:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train a grid of settings in one program, and say how much of its spread chance alone makes.
+    """Search settings: a file of ranges, or the paper's grid. Stopped or killed, the same command goes on.
 
-    paper-grid is the paper's: learning rate × ε₀ × τ₀, 27 points, by shaped reward over the first 500 episodes;
-    the winner is trained again on fresh seeds beside the paper's choice. Stopped, the same command goes on.
+    FILE.toml says what is searched and by which metric (docs/guides/cluster.md); every trial is a run folder. Trials
+    are trained here, one after the other, or on a Ray cluster, where Optuna proposes them and poor ones are given up.
 
-    example:
+    paper-grid is the paper's: learning rate × ε₀ × τ₀, 27 points in one program, by shaped reward over the first 500
+    episodes; the winner is trained again on fresh seeds beside the paper's choice, and beside what chance alone makes.
+
+    examples:
+      gacrl sweep search.toml
+      gacrl sweep search.toml --ray 10.0.0.1:6379     pip install 'gacrl[ray]'
       gacrl sweep paper-grid --out runs/grid
     """
 
-    grid: tyro.conf.Positional[Literal["paper-grid"]]
-    """Which grid."""
-    seeds: int = 2
-    """Seeds of each point."""
-    episodes: int = 500
-    """Episodes of each seed."""
-    out: Path = Path("runs/paper-grid")
-    """The folder of the results and the report."""
+    spec: tyro.conf.Positional[str]
+    """A TOML file, or paper-grid."""
+    ray: str | None = None
+    """HOST:PORT of a Ray cluster's head, or auto."""
+    trial_cpus: float = 1.0
+    """CPU cores that a trial takes, with --ray."""
+    trial_gpus: float = 0.0
+    """And GPUs."""
+    seeds: int | None = None
+    """Seeds of each point of paper-grid; none: 2."""
+    episodes: int | None = None
+    """Episodes of each seed of paper-grid; none: 500."""
+    out: Path | None = None
+    """The folder of the results and the report; none: runs/ and the name of the file or grid."""
     json: bool = False
     """Make the last line of the output one JSON object."""
 

@@ -17,9 +17,10 @@ from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
-    from gacrl.arguments import Resume
+    from gacrl.arguments import Cluster, Resume, Sweep
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.reproduce import Reproduction
+    from gacrl.experiments.search import Search
     from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher, TerminalWatcher
     from gacrl.training.session import Run, Watcher
@@ -36,7 +37,7 @@ usage: gacrl COMMAND [OPTIONS]
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
-  sweep      the paper's grid of settings, and the spread that chance alone makes
+  sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -92,12 +93,11 @@ def _train(words: list[str]) -> int:
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def start(watcher: "Watcher") -> "Run":
-        from gacrl.training import devices, session
+        from gacrl.training import session
 
-        devices.prepare_jax(config.num_seeds)
         return session.start(config, asked.out, watcher)
 
-    return _watched(start, asked.json)
+    return _watched(start, asked.json, config, asked.cluster)
 
 
 def _resume(words: list[str]) -> int:
@@ -108,14 +108,19 @@ def _resume(words: list[str]) -> int:
         raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
     if asked.diagnose:
         return _diagnose(asked)
+    from gacrl.training import recorder
+
+    config = recorder.RunFolder.open(asked.run).config()
+    if asked.extend is not None:
+        env_steps = config.training.env_steps + asked.extend
+        config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def resume(watcher: "Watcher") -> "Run":
-        from gacrl.training import devices, recorder, session
+        from gacrl.training import session
 
-        devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
         return session.resume(asked.run, asked.extend, watcher)
 
-    return _watched(resume, asked.json)
+    return _watched(resume, asked.json, config, asked.cluster)
 
 
 def _diagnose(asked: "Resume") -> int:
@@ -135,14 +140,24 @@ def _diagnose(asked: "Resume") -> int:
     return 0
 
 
-def _watched(work: Callable[["Watcher"], "Run"], as_json: bool) -> int:
+def _watched(work: Callable[["Watcher"], "Run"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
+    cluster.check()
     from gacrl.progress import TerminalWatcher
+    from gacrl.training import devices, distributed
 
-    with TerminalWatcher() as terminal, _stopping(terminal):
-        run = work(terminal.watcher())
+    place = distributed.ALONE
+    if cluster.distributed:
+        place = distributed.find_place(cluster.coordinator, cluster.num_processes, cluster.process_id)
+    devices.prepare_jax(-(-config.num_seeds // place.count))
+    with (
+        TerminalWatcher(quiet=place.process > 0) as terminal,
+        _stopping(terminal),
+        distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
+    ):
+        run = work(watcher)
     terminal.report(run)
-    if as_json:
+    if as_json and not terminal.quiet:
         print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
     return 0 if run.summary is not None else terminal.exit_code
 
@@ -266,7 +281,9 @@ def _reproduce(words: list[str]) -> int:
     return _studied(study, asked.out, asked.json)
 
 
-def _studied(study: Callable[["Watch"], "Ablation | Reproduction | None"], out: Path, as_json: bool) -> int:
+def _studied(
+    study: Callable[["Watch"], "Ablation | Reproduction | Search | None"], out: Path, as_json: bool
+) -> int:
     """Make a study of many runs under the eyes of the terminal; Ctrl-C ends as in training."""
     from gacrl.experiments.study import Watch
     from gacrl.progress import RunsWatcher
@@ -302,17 +319,45 @@ def _sweep(words: list[str]) -> int:
     from gacrl import arguments
 
     asked = arguments.parse(arguments.Sweep, words, "sweep")
+    out = asked.out or Path("runs") / Path(asked.spec).stem
+    if asked.spec != "paper-grid":
+        return _search(asked, out)
+    if asked.ray is not None:
+        raise UserError("paper-grid is one compiled program and needs no cluster: leave --ray out")
+    seeds = 2 if asked.seeds is None else asked.seeds
     from gacrl.training.devices import prepare_jax
 
-    prepare_jax(27 * max(asked.seeds, 1))
+    prepare_jax(27 * max(seeds, 1))
     from gacrl.experiments import sweep
 
-    grid = sweep.paper_grid(asked.seeds, asked.episodes)
-    done = sweep.sweep(grid, asked.out, say=lambda line: print(line, flush=True))
+    grid = sweep.paper_grid(seeds, 500 if asked.episodes is None else asked.episodes)
+    done = sweep.sweep(grid, out, say=lambda line: print(line, flush=True))
     print(f"report     {done.report}")
     if asked.json:
         print(json.dumps(done.to_dict()))
     return 0
+
+
+def _search(asked: "Sweep", out: Path) -> int:
+    """A search that a file describes, here or on a cluster."""
+    if asked.seeds is not None or asked.episodes is not None:
+        raise UserError(f"--seeds and --episodes are for paper-grid: say seeds and env_steps in {asked.spec}")
+    if asked.trial_cpus <= 0 or asked.trial_gpus < 0:
+        raise UserError("--trial-cpus must be above 0, and --trial-gpus not below it")
+    from gacrl.experiments import search
+    from gacrl.training.devices import prepare_jax
+
+    spec = search.load(Path(asked.spec))
+    prepare_jax(spec.config.num_seeds)
+
+    def study(watch: "Watch") -> "search.Search | None":
+        if asked.ray is None:
+            return search.search(spec, out, watch)
+        from gacrl.experiments.ray_search import ray_search
+
+        return ray_search(spec, out, asked.ray, asked.trial_cpus, asked.trial_gpus, watch)
+
+    return _studied(study, out, asked.json)
 
 
 def _presets(words: list[str]) -> int:

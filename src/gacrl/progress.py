@@ -30,10 +30,14 @@ _SHOWN = {
 
 
 class TerminalWatcher:
-    """Follows a run. On a terminal the line lives, also while things compile; elsewhere it is a line each."""
+    """Follows a run. On a terminal the line lives, also while things compile; elsewhere it is a line each.
 
-    def __init__(self) -> None:
-        self._console = _console()
+    quiet: say nothing; another process does.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self._console = _console(quiet)
         self._alive = self._console.is_terminal
         self._line = _Line()
         self._live = Live(self._line, console=self._console, refresh_per_second=8, transient=True)
@@ -102,6 +106,8 @@ class TerminalWatcher:
     def report(self, run: Run) -> None:
         """The end: what was reached, the paper's tables where they apply, and where everything lies."""
         self._live.stop()
+        if self.quiet:
+            return
         say = self._print
         if run.summary is None:
             say(f"stopped at environment step {run.env_steps:,}; go on with: gacrl resume {run.folder}")
@@ -230,9 +236,9 @@ class RunsWatcher:
         return table
 
 
-def _console() -> Console:
+def _console(quiet: bool = False) -> Console:
     """Colours and the terminal's width on a terminal; elsewhere lines that a log can hold."""
-    console = Console(highlight=False, markup=False, emoji=False)
+    console = Console(highlight=False, markup=False, emoji=False, quiet=quiet)
     if not console.is_terminal:
         console.width = 130
     return console

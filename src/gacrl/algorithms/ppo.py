@@ -24,7 +24,7 @@ from gacrl.algorithms.objectives import (
     no_returns,
 )
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns
-from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, taken
+from gacrl.algorithms.shared import clipped_adam, mean_real, share_out, share_reward, taken
 from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
@@ -288,8 +288,8 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
 
         def gradient_step(loop: tuple[Network, Any], rows: Int[Array, " rows"]):
             network, optimizer = loop
-            part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
-            remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
+            part = share_out(jax.tree.map(lambda leaf: leaf[:, rows], sample), axis=1)
+            remembered = share_out(jax.tree.map(lambda leaf: leaf[rows], memory))
             gradients, metrics = jax.grad(loss, has_aux=True)(
                 network, part, remembered, hyper, ent_coef, config.huber_delta
             )

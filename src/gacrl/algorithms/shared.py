@@ -3,7 +3,25 @@
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+ENVS = "envs"
+"""The axis of a mesh over which one seed's environments are spread (training.devices)."""
+
+
+def share_out(tree: PyTree, axis: int = 0) -> PyTree:
+    """Ask the compiler to give each device of the axis `envs` a share of this axis; where there is none, nothing.
+
+    An axis that cannot be shared evenly is left as it is: every device then has all of it.
+    """
+    devices = dict(jax.sharding.get_abstract_mesh().shape).get(ENVS, 1)
+    if devices == 1:
+        return tree
+    layout = PartitionSpec(*[None] * axis, ENVS)
+    return jax.tree.map(
+        lambda leaf: leaf if leaf.shape[axis] % devices else jax.lax.with_sharding_constraint(leaf, layout), tree
+    )
 
 
 def clipped_adam(max_grad_norm: float, eps: float = 1e-8) -> optax.GradientTransformation:

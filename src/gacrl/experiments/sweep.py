@@ -201,7 +201,7 @@ def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[
     """The mean score of each member's episodes; a group that is not full is filled up with its last member."""
     filled = [*group, *[group[-1]] * (trainer.num_seeds - len(group))]
     states = [trainer.init_member(stream_key("training", seed), _hyper(trainer, point)) for point, seed in filled]
-    state = shard_seeds(stack_seeds(states), trainer.num_seeds)
+    state = shard_seeds(stack_seeds(states), trainer.mesh)
     place = trainer.metric_names.index(SCORE)
     total, ended = np.zeros(len(group)), np.zeros(len(group))
     updates = -(-grid.episodes * grid.config.env.max_cycles // grid.config.steps_per_update)

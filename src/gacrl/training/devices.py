@@ -1,17 +1,22 @@
-"""How this machine is used: its devices, the compilation cache, and independent seeds side by side."""
+"""How this machine is used: devices, the compilation cache, independent seeds side by side, several processes."""
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
+
+from gacrl.algorithms.shared import ENVS
+from gacrl.errors import UserError
 
 _CACHE_BYTES = 512 * 2**20
 """Bound of the compilation cache; the oldest programs go first."""
@@ -50,9 +55,40 @@ def compiler_options() -> dict[str, str]:
     return {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"} if tested else {}
 
 
-def devices_for(num_seeds: int) -> list[Any]:
-    """As many devices as can be kept busy by this many seeds."""
-    return jax.local_devices()[: min(num_seeds, jax.local_device_count())]
+def mesh_for(num_seeds: int, num_envs: int | None = None) -> Mesh:
+    """The devices of all processes, as many as can be kept busy, with the axes `seeds` and `envs`.
+
+    num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; one process
+    on a CPU leaves them together. Raises UserError where some process would have nothing to do.
+    """
+    seeds, envs, devices = _shares(num_seeds, num_envs)
+    uneven = num_envs is not None and num_envs % envs > 0
+    if jax.process_count() == 1:
+        if uneven:
+            seeds, envs = min(num_seeds, len(devices)), 1
+    elif num_envs is None and num_seeds < jax.process_count():
+        raise UserError(
+            f"{jax.process_count()} processes cannot share {num_seeds} seeds of an algorithm that learns from replay: "
+            f"give --num-seeds {jax.process_count()} or more, start fewer processes, or take a PPO preset"
+        )
+    elif uneven:
+        raise UserError(
+            f"training.num_envs {num_envs} cannot be shared evenly by the {envs} devices of a seed: make it a multiple"
+        )
+    return Mesh(np.asarray(devices[: seeds * envs]).reshape(seeds, envs), ("seeds", ENVS))
+
+
+def _shares(num_seeds: int, num_envs: int | None) -> tuple[int, int, list[Any]]:
+    """How many groups of seeds, how many devices for each, and the devices, those of a process side by side."""
+    local = Counter(device.process_index for device in jax.devices())
+    each = min(local.values())
+    if num_envs is None or jax.default_backend() == "cpu":
+        each = min(each, -(-num_seeds // len(local)))
+    devices = [device for k in sorted(local) for device in jax.local_devices(k)[:each]]
+    if num_envs is None or num_seeds >= len(devices):
+        return len(devices), 1, devices
+    seeds = max(count for count in range(1, num_seeds + 1) if len(devices) % count == 0)
+    return seeds, len(devices) // seeds, devices
 
 
 @jax.jit
@@ -64,22 +100,27 @@ def stack_seeds(members: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
 
-def shard_seeds(stacked: PyTree, num_seeds: int) -> PyTree:
-    """A stacked pytree laid out on the devices.
+def shard_seeds(stacked: PyTree, mesh: Mesh) -> PyTree:
+    """A stacked pytree laid out on the devices; with several processes each has the whole of it to begin with.
 
     Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
     """
-    devices = devices_for(num_seeds)
-    sharding = NamedSharding(Mesh(np.asarray(devices), ("seeds",)), PartitionSpec("seeds"))
-    if len(devices) == 1:
-        return jax.device_put(stacked, sharding)
-    parts = map(jax.device_put, _split(stacked, len(devices)), devices)
+    layout = NamedSharding(mesh, PartitionSpec("seeds"))
+    if mesh.size == 1:
+        return jax.device_put(stacked, layout)
+    parts = _split(stacked, mesh.shape["seeds"])
+    own = [
+        jax.device_put(part, device)
+        for part, group in zip(parts, mesh.devices, strict=True)
+        for device in group
+        if device.process_index == jax.process_index()
+    ]
 
     def whole(*shards: jax.Array) -> jax.Array:
-        shape = (len(shards) * shards[0].shape[0], *shards[0].shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, sharding, list(shards))
+        shape = (len(parts) * shards[0].shape[0], *shards[0].shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, layout, list(shards))
 
-    return jax.tree.map(whole, *parts)
+    return jax.tree.map(whole, *own)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -91,6 +132,47 @@ def _split(stacked: PyTree, parts: int) -> list[PyTree]:
         return jnp.split(padded, parts)[number]
 
     return [jax.tree.map(partial(part, number=number), stacked) for number in range(parts)]
+
+
+def gathered(tree: PyTree) -> PyTree:
+    """What is spread over several processes, whole in each of them; all must call it. Anything else as it is."""
+    if jax.process_count() == 1:
+        return tree
+    wait_for_all()
+    leaves = jax.tree.leaves(tree)
+    whole = _gathering(leaves[0].sharding.mesh)(tree)
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), whole)
+
+
+@cache
+def _gathering(mesh: Mesh) -> Callable[[PyTree], PyTree]:
+    return jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def leads() -> bool:
+    """Whether this process writes: one of several does."""
+    return jax.process_index() == 0
+
+
+def anyone(yes: bool) -> bool:
+    """Whether any of the processes says yes; all must ask."""
+    return yes if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.asarray(yes)).any())
+
+
+def wait_for_all() -> None:
+    """Go on when all processes are here.
+
+    gloo gives processes 30 s between the first and the last to set up what they need for a new computation, less than
+    compiling may take; for one that is set up it waits as long as it must. This one is set up when a process joins.
+    """
+    anyone(False)
+
+
+def same_everywhere(number: int) -> bool:
+    """Whether all processes have the same number; all must ask, and none goes on before all have."""
+    if jax.process_count() == 1:
+        return True
+    return len(set(multihost_utils.process_allgather(np.asarray(number)).tolist())) == 1
 
 
 def one_seed(stacked: PyTree, member: int) -> PyTree:
@@ -114,7 +196,7 @@ def rows(stacked: PyTree, start: int, stop: int) -> PyTree:
     fetched: list[list[jax.Array]] = []
     before = 0
     for leaf in leaves:
-        shards = sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start or 0)
+        shards = sorted(_distinct(leaf), key=lambda shard: shard.index[0].start or 0)
         held = leaf.shape[0] // len(shards)
         first, last = start // held, (stop - 1) // held
         fetched.append([jax.device_put(shard.data, home) for shard in shards[first : last + 1]])
@@ -132,14 +214,18 @@ def _joined(parts: list[list[jax.Array]], start: int, stop: int) -> list[jax.Arr
     return [jnp.concatenate(leaf)[start:stop].copy() for leaf in parts]
 
 
-def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
+def _distinct(leaf: jax.Array) -> list[Any]:
+    """Its shards, each once: the environments of a seed may be spread over several devices, its state is on each."""
+    return [shard for shard in leaf.addressable_shards if shard.replica_id == 0]
+
+
+def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     """`function(member, *shared)` for one seed, as a function of the stacked seeds.
 
     Seeds are sharded over the devices. Within one device they take turns: on a CPU, mapping them instead makes
-    every small matrix product a batch of them, and gains nothing (docs/design.md).
+    every small matrix product a batch of them, and gains nothing (docs/design.md). What is within a seed is left to
+    the compiler to spread over the axis `envs`, as `algorithms.shared.share_out` asks.
     """
-    devices = devices_for(num_seeds)
-    mesh = Mesh(np.asarray(devices), ("seeds",))
 
     def on_one_device(stacked: PyTree, *shared: PyTree) -> PyTree:
         if jax.tree.leaves(stacked)[0].shape[0] == 1:
@@ -150,15 +236,19 @@ def map_seeds(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any
         return jax.lax.map(lambda member: function(member, *shared), stacked)
 
     def on_all_devices(stacked: PyTree, *shared: PyTree) -> PyTree:
-        if len(devices) == 1:
+        if mesh.size == 1:
             return on_one_device(stacked, *shared)
         seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
-        return jax.shard_map(
+        mapped = jax.shard_map(
             on_one_device,
             mesh=mesh,
             in_specs=(seeds, *[everywhere] * len(shared)),
             out_specs=seeds,
+            axis_names={"seeds"} if mesh.shape[ENVS] > 1 else set(mesh.axis_names),
             check_vma=False,
         )(stacked, *shared)
+        if mesh.shape[ENVS] == 1:
+            return mapped
+        return jax.lax.with_sharding_constraint(mapped, NamedSharding(mesh, seeds))
 
     return on_all_devices

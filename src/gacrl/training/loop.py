@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from gacrl.config import RunConfig
+from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
@@ -44,6 +45,8 @@ class Progress:
     """What `metrics.jsonl` gets: one object per seed."""
     state: TrainState
     """The training state, valid until the next chunk starts."""
+    whole: TrainState
+    """The same; where it is spread over several processes, all of it in each of them."""
 
     @property
     def done(self) -> bool:
@@ -82,6 +85,7 @@ def train(
             begun = time.perf_counter()
             chunk = trainer.chunk.lower(state, updates).compile()
             compiling += time.perf_counter() - begun
+            wait_for_all()
         begun = time.perf_counter()
         state, report = jax.block_until_ready(chunk(state, updates))
         training += time.perf_counter() - begun
@@ -93,18 +97,17 @@ def train(
             "greedy": trainer.evaluate(state.learner, False, "monitor", config.evaluation.num_episodes),
             "sampled": trainer.evaluate(state.learner, True, "monitor", config.evaluation.num_episodes),
         }
-        evaluations = jax.device_get(evaluations)
+        evaluations = jax.device_get(gathered(evaluations))
         if first:  # compiling is nearly all of the first evaluation
             compiling += time.perf_counter() - begun
         wall = before.wall + time.perf_counter() - started
         clock = Clock(wall, training, compiling, timed)
-        finished = jax.device_get(state.episodes)
-        rows = _rows(
-            config, jax.device_get(report), trainer.metric_names, evaluations, done * per_update, finished, clock
-        )
+        whole = gathered(state)
+        report, finished = jax.device_get((gathered(report), whole.episodes))
+        rows = _rows(config, report, trainer.metric_names, evaluations, done * per_update, finished, clock)
         told = [row["update"] for row in rows]
-        require_finite(config.seeds, told, state.learner, (done - updates) * per_update, done * per_update)
-        yield Progress(done * per_update, total * per_update, clock, rows, state)
+        require_finite(config.seeds, told, whole.learner, (done - updates) * per_update, done * per_update)
+        yield Progress(done * per_update, total * per_update, clock, rows, state, whole)
 
 
 def _rows(

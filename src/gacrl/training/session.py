@@ -3,6 +3,7 @@
 import platform
 import subprocess
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import metadata
@@ -11,10 +12,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from gacrl import config as configuration
 from gacrl import envs, render
-from gacrl.algorithm_config import LearningConfig
+from gacrl.algorithm_config import LearningConfig, PpoConfig
 from gacrl.algorithms import algorithm as algorithms
 from gacrl.config import RunConfig
 from gacrl.envs import scripted
@@ -24,7 +26,7 @@ from gacrl.evaluation import episodes
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint, curriculum, memory
-from gacrl.training.devices import devices_for, one_seed, shard_seeds
+from gacrl.training.devices import anyone, gathered, leads, mesh_for, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged
 from gacrl.training.keeper import FOR_LEARNING, ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
@@ -45,7 +47,8 @@ class Run:
     config: RunConfig
     env_steps: int
     summary: dict[str, Any] | None
-    """The content of `summary.json`; None where the run was stopped before its end."""
+    """The content of `summary.json`; None where the run was stopped before its end. Empty in processes that do not
+    write."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,14 @@ def build(config: RunConfig) -> Trainer:
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,
         evaluation_env=evaluation_env(config),
+        mesh=mesh(config),
+    )
+
+
+def mesh(config: RunConfig) -> Mesh:
+    """The devices that train this configuration: PPO learns from environments that are spread over several."""
+    return mesh_for(
+        config.num_seeds, config.training.num_envs if isinstance(config.algorithm, PpoConfig) else None
     )
 
 
@@ -99,7 +110,7 @@ def evaluation_env(config: RunConfig) -> Spread:
 
 def plan(trainer: Trainer, config: RunConfig) -> Plan:
     """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
-    member, devices = _member_shapes(trainer), devices_for(config.num_seeds)
+    member, devices = _member_shapes(trainer), list(trainer.mesh.devices.flat)
     state, working = memory.size(member), memory.working_bytes(config, member)
     needed = 2 * state * config.num_seeds + working * len(devices)
     memory.require_room(needed, devices[0])
@@ -116,8 +127,8 @@ def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = 
     """Train from the beginning, into a new run folder."""
     watcher, trainer = watcher or Watcher(), build(config)
     planned = plan(trainer, config)
-    folder = RunFolder.create(out, config)
-    with folder.locked():
+    folder = RunFolder.create(out, config) if leads() else RunFolder(out or Path("runs"))
+    with folder.locked() if leads() else nullcontext():
         watcher.planned(folder, config, planned)
         return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config))
 
@@ -126,17 +137,20 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
     watcher = watcher or Watcher()
     folder = RunFolder.open(path)
-    with folder.locked():
+    mesh(folder.config())
+    with folder.locked() if leads() else nullcontext():
         config = folder.config()
         found = newest_checkpoint(folder, watcher.warn)
+        if not same_everywhere(-1 if found is None else found.env_steps):
+            raise UserError(f"the processes see different checkpoints in {folder.path}: put it where all share it")
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
         trainer = build(config)
         planned = plan(trainer, config)
-        if found is not None:
+        if found is not None and leads():
             checkpoint.set_aside_after(folder.checkpoints, found.env_steps)
-        if extend is not None:
+        if extend is not None and leads():
             folder.extend(config.training.env_steps)
         watcher.planned(folder, config, planned)
         fingerprint = configuration.fingerprint(folder.settings())
@@ -170,7 +184,7 @@ def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | 
     """The training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
-    return shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), config.num_seeds)
+    return shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), trainer.mesh)
 
 
 def _run(
@@ -184,8 +198,8 @@ def _run(
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     state = restore(trainer, config, found)
     try:
-        rows = folder.forget_metrics_after(env_steps)
-        if found is not None and rows != found.counters.get(ROWS, rows):
+        rows = folder.forget_metrics_after(env_steps) if leads() else 0
+        if leads() and found is not None and rows != found.counters.get(ROWS, rows):
             watcher.warn(
                 f"{folder.metrics_file} has {rows} of the {found.counters[ROWS]} lines that were written up to "
                 f"environment step {env_steps}: the others are lost, what follows is not"
@@ -194,11 +208,12 @@ def _run(
             keep = Keeper(folder, config.num_seeds, fingerprint, writer, rows)
             for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
                 env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-                writer.wait()  # one evaluation at most is ahead of its checkpoint
-                folder.append_metrics(list(progress.rows))
-                keep(progress)
+                if leads():
+                    writer.wait()  # one evaluation at most is ahead of its checkpoint
+                    folder.append_metrics(list(progress.rows))
+                    keep(progress)
                 watcher.progress(progress)
-                if watcher.stop() and not progress.done:
+                if anyone(watcher.stop()) and not progress.done:
                     return Run(folder.path, config, env_steps, None)
         watcher.finishing()
         summary = _finish(folder, config, trainer, state, env_steps, clock)
@@ -228,9 +243,12 @@ def _finish(
     num_episodes = config.evaluation.final_episodes
     env = evaluation_env(config)
     final = {
-        kind: jax.device_get(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes))
+        kind: jax.device_get(gathered(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes)))
         for kind in ("greedy", "sampled")
     }
+    learner = one_seed(gathered(state.learner), 0)
+    if not leads():
+        return {}
     references = evaluate_scripted(env, num_episodes)
     members = len(config.seeds)
     summary = {
@@ -250,7 +268,7 @@ def _finish(
         "versions": versions(),
     }
     folder.write_summary(summary)
-    policy = trainer.algorithm.policy(one_seed(state.learner, 0), False)
+    policy = trainer.algorithm.policy(learner, False)
     shown = episodes.record_many(
         env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
     )
@@ -302,7 +320,7 @@ def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = _stacked_shapes(trainer).learner
     learners = checkpoint.load(found, shapes, prefix=".learner", skip=FOR_LEARNING)
-    return shard_seeds(learners, trainer.num_seeds)
+    return shard_seeds(learners, trainer.mesh)
 
 
 def _stacked_shapes(trainer: Trainer) -> TrainState:

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from gacrl import rollout
 from gacrl.algorithms.algorithm import Algorithm, Hyper
+from gacrl.algorithms.shared import share_out
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation.evaluate import Stream, evaluate, stream_key
 from gacrl.evaluation.metrics import (
@@ -25,7 +27,7 @@ from gacrl.evaluation.metrics import (
     no_steps,
 )
 from gacrl.training.curriculum import Curriculum, CurriculumState
-from gacrl.training.devices import compiler_options, map_seeds, shard_seeds, stack_seeds
+from gacrl.training.devices import compiler_options, map_seeds, mesh_for, shard_seeds, stack_seeds
 from gacrl.types import Learner, Metrics, PRNGKey
 
 
@@ -70,6 +72,7 @@ class Trainer:
         num_steps: int,
         num_seeds: int = 1,
         evaluation_env: Environment | None = None,
+        mesh: Mesh | None = None,
     ):
         self.algorithm = algorithm
         self.env = env
@@ -78,17 +81,19 @@ class Trainer:
         self.num_steps = num_steps
         self.num_seeds = num_seeds
         self.evaluation_env = env if evaluation_env is None else evaluation_env
+        self.mesh = mesh_for(num_seeds) if mesh is None else mesh
+        """The devices that the seeds, and perhaps their environments, are spread over."""
         self.memory = algorithm.initial_memory(env.num_agents)
         self.measures = _measures(env)
         self.metric_names = metric_names(self.measures)
         """What the vectors of a chunk's episode summary hold."""
         self.chunk = jax.jit(
-            map_seeds(self.chunk_of_one, num_seeds), donate_argnums=0, compiler_options=compiler_options()
+            map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=compiler_options()
         )
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
         """Fresh training states of these seeds, stacked."""
-        return shard_seeds(self.init_stacked(seeds), self.num_seeds)
+        return shard_seeds(self.init_stacked(seeds), self.mesh)
 
     def init_stacked(self, seeds: tuple[int, ...]) -> TrainState:
         """The same, not yet laid out on the devices."""
@@ -124,7 +129,7 @@ class Trainer:
             self.algorithm.policy(state.learner, True),
             self.memory,
             state.env_params,
-            state.carry,
+            share_out(state.carry),
             rollout_key,
             self.num_steps,
         )
@@ -192,7 +197,7 @@ class Trainer:
             policy = self.algorithm.policy(learner, explore)
             return evaluate(env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes)
 
-        return map_seeds(one, self.num_seeds)(learners)
+        return map_seeds(one, self.mesh)(learners)
 
 
 def _measures(env: Environment) -> list[str]:
