@@ -105,7 +105,7 @@ def flip_a_byte(path: Path) -> None:
         ("train --env.num-agents 0", "env.num_agents must be between 1 and 10000, not 0", "gacrl train --help"),
         ("train --env.num-agents three", "--env.num-agents", "gacrl train --help"),
         ("train --env-steps many", "--env-steps", "gacrl train --help"),
-        ("train --env.reward mpe", "'mpe'", "('mpe2', 'paper', 'coverage')"),
+        ("train --env.reward mpe", "'mpe'", "('mpe2', 'paper', 'coverage', 'potential')"),
         ("train --preset paper --algorithm.encoder-hidden a", "--algorithm.encoder-hidden", "gacrl train --help"),
         ("train --algorithm.learning-rate nan", "algorithm.learning_rate", "between 0 and 1"),
         ("train --preset paper --algorithm.epsilon 0.9", "algorithm.epsilon", "must not exceed 1"),

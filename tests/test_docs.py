@@ -20,6 +20,7 @@ class Understood(BaseException):
 
 def commands(text: str) -> list[list[str]]:
     """Every whole `gacrl` command in backticks, or on a line of its own in a block or a help text."""
+    text = re.sub(r" *\\\n *", " ", text)  # a line that goes on
     found = re.findall(r"`gacrl ([^`]+)`|^ *gacrl ([^#\n]+)", text, flags=re.MULTILINE)
     lines = (re.split(r"  | > ", inline or line)[0] for inline, line in found)
     return [words for words in map(shlex.split, lines) if words and not PLACEHOLDERS & set(words)]

@@ -58,16 +58,18 @@ def test_when_the_world_turns_the_actions_turn(preset: str, continuous: bool):
 def test_it_is_the_mean_over_eight_conversations():
     """By hand: the network asked in each turned world, its numbers turned back."""
     env = Spread(num_agents=3, num_landmarks=3)
-    algorithm, (_, seen) = made("gacrl", env, symmetric=True), env.reset(jax.random.key(3))
+    algorithm, (_, seen) = made("gacrl", env, symmetric=True), jax.jit(env.reset)(jax.random.key(3))
     learner = drawn_learner(algorithm)
-    decision, _ = algorithm.policy(learner, False)(algorithm.initial_memory(3), seen, jax.random.key(0), Channel())
+    play = jax.jit(algorithm.policy(learner, False))
+    decision, _ = play(algorithm.initial_memory(3), seen, jax.random.key(0), Channel())
+    ask = jax.jit(lambda symmetry: learner.target.agent(env.turn(seen, symmetry))[0])
     total = np.zeros((3, 5))
     for symmetry in range(8):
-        numbers = learner.target.agent(env.turn(seen, jnp.asarray(symmetry)))[0].head
+        numbers = ask(symmetry).head
         for action in range(5):
             total[:, action] += numbers[:, env.turn_action(jnp.asarray(action), jnp.asarray(symmetry))]
     np.testing.assert_array_equal(decision.action, total.argmax(1))
-    np.testing.assert_array_equal(decision.message, learner.target.agent(seen)[0].message)
+    np.testing.assert_array_equal(decision.message, ask(0).message)
 
 
 def test_a_network_with_a_memory_is_refused():

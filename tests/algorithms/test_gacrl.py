@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import drawn
 
 from gacrl import config as configuration
 from gacrl.algorithm_config import NetworkConfig
@@ -41,11 +42,9 @@ TRAINING = TrainingConfig(env_steps=100, num_envs=2, num_steps=5)
 
 
 def test_the_teams_value_is_the_critics_less_what_each_agent_falls_short():
-    key = jax.random.key(0)
-    _, seen = ENV.reset(key)
-    agent = AgentNetwork(ENV, TALKING, 5, key)
-    network = Network(agent, (Mlp(8, (8,), key), Linear(8, 1, key)))
-    output, _ = agent(seen)
+    _, seen = jax.jit(ENV.reset)(jax.random.key(0))
+    network = Network(drawn(AgentNetwork, ENV, TALKING, 5), (drawn(Mlp, 8, (8,)), drawn(Linear, 8, 1)))
+    output, _ = jax.jit(lambda seen: network.agent(seen))(seen)
     best = output.head.argmax(-1)
     layers, head = network.team
     value = head(layers(output.hidden.mean(0)))
@@ -64,9 +63,9 @@ def test_the_teams_value_is_the_critics_less_what_each_agent_falls_short():
 def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():
     """By itself, with its own observation and its neighbours' symbols, an agent computes what the team's program does."""
     key = jax.random.key(1)
-    _, seen = ENV.reset(key)
-    network = AgentNetwork(ENV, replace(TALKING, rounds=2), 5, key)
-    together, _ = network(seen)
+    _, seen = jax.jit(ENV.reset)(key)
+    network = drawn(AgentNetwork, ENV, replace(TALKING, rounds=2), 5)
+    together, _ = jax.jit(lambda seen: network(seen))(seen)
     talk, code = network.communication, network.code
     assert code is not None
 

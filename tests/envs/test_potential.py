@@ -72,10 +72,10 @@ def test_an_episode_pays_back_what_it_was_lent(terminates):
 def test_many_copies_are_shaped_like_one():
     env = Spread(3, 3, reward="potential")
     keys = jax.random.split(jax.random.key(0), 4)
-    states, _ = jax.vmap(env.reset)(keys)
+    states, _ = jax.jit(jax.vmap(env.reset))(keys)
     actions = jnp.array([[0, 1, 2], [3, 4, 0], [1, 1, 1], [2, 3, 4]])
-    _, together = env.step_many(states, actions, keys)
-    _, alone = jax.vmap(env.step)(states, actions, keys)
+    _, together = jax.jit(env.step_many)(states, actions, keys)
+    _, alone = jax.jit(jax.vmap(env.step))(states, actions, keys)
     np.testing.assert_allclose(together.reward, alone.reward, rtol=1e-5, atol=1e-6)
 
 
