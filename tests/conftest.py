@@ -31,6 +31,7 @@ def compiled_quickly(factory: pytest.TempPathFactory) -> Generator[dict[str, str
     """
     settings = {
         "jax_compilation_cache_dir": str(factory.getbasetemp() / "compiled"),
+        "jax_compilation_cache_max_size": -1,  # of a bounded one, processes with other settings break the books
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_disable_most_optimizations": True,
     }
@@ -74,6 +75,10 @@ def drawn_learner(algorithm: Any, seed: int = 0) -> Any:
     return learner._replace(target=network) if hasattr(learner, "target") else learner
 
 
+SCRIPTED_ROW = {"reward_shaped": np.array([12.25, 12.75]), "coverage_mean_theta": np.array([0.25, 0.75])}
+"""In place of the scripted policies' rows in the paper's tables, which would take longer to compile than all the rest."""
+
+
 class TinyRun(NamedTuple):
     folder: Path
     words: list[str]
@@ -108,11 +113,9 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
         *("--evaluation.num-episodes", "4", "--evaluation.final-episodes", "8"),
         *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
     ]
-    # The scripted policies' rows in the paper's tables would take longer to compile than all the rest.
-    measured = {"reward_shaped": np.array([12.25, 12.75]), "coverage_mean_theta": np.array([0.25, 0.75])}
     said = io.StringIO()
     with compiled_quickly(tmp_path_factory), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_tables, "_play_scripted", lambda *task: measured)
+        patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         with contextlib.redirect_stdout(said):
             assert main(["train", *words, "--out", str(folder), "--json"]) == 0
     return TinyRun(folder, words, said.getvalue())

@@ -29,7 +29,8 @@ def untrained(config: RunConfig, path: Path) -> Path:
     """The folder of a run that has a checkpoint before its first step."""
     folder = RunFolder.create(path, config)
     state = without_padding(session.build(config).init(config.seeds), config.num_seeds)
-    checkpoint.save(folder.checkpoints, state, 0, fingerprint(config), {})
+    tensors = checkpoint.serialise(checkpoint.arrays(state))
+    checkpoint.save(folder.checkpoints, tensors, 0, fingerprint(config), {})
     return folder.path
 
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import SCRIPTED_ROW
 
 import gacrl
 from gacrl import cli, config
-from gacrl.experiments import scoring
+from gacrl.experiments import paper_tables, scoring
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -55,6 +56,7 @@ def room(tmp_path_factory, quick_start):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "PRESETS", MappingProxyType({**config.PRESETS, **presets}))
         patch.setattr(scoring, "score_run", few)
+        patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         patch.chdir(tmp_path_factory.mktemp("readme"))
         yield
 

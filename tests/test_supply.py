@@ -44,7 +44,8 @@ def faults(source: str) -> list[str]:
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(SOURCES[0].parent)))
 def test_sources_neither_run_what_they_read_nor_fetch(path: Path):
-    assert faults(path.read_text(encoding="utf-8")) == []
+    talks = path.name in ("peers.py", "ray_search.py")  # --distributed and --ray name who to talk to
+    assert faults(path.read_text(encoding="utf-8")) == ["socket"] * talks
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from gacrl.config import RunConfig
 from gacrl.experiments import search, study
 from gacrl.experiments.search import Searched, proposals
 from gacrl.experiments.study import Watch
-from gacrl.training.loop import Diverged
+from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Run, Watcher
 

@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 import safetensors.numpy
 from conftest import TinyRun
@@ -252,8 +254,8 @@ def test_many_values_in_the_files_of_a_run(tiny_run: TinyRun, name: str, where: 
 
 # Safetensors that are none, with a checksum that fits.
 
-TENSORS = safetensors.numpy.save({"w": checkpoint.np.arange(6.0), "n": checkpoint.np.arange(3)})
-LIKE = {"w": checkpoint.np.zeros(6), "n": checkpoint.np.zeros(3, int)}
+TENSORS = safetensors.numpy.save({"w": np.arange(6, dtype=np.float32), "n": np.arange(3, dtype=np.int32)})
+LIKE = {"w": jax.ShapeDtypeStruct((6,), np.float32), "n": jax.ShapeDtypeStruct((3,), np.int32)}
 
 
 @searched(10 * FEW)

@@ -17,7 +17,7 @@ from gacrl.training.session import Run, Watcher
 pytestmark = pytest.mark.usefixtures("quick_start")
 
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
-FAMILIES = ("gacrl", "mappo")
+FAMILIES = ("vdn", "mappo")
 """One of each learner, for every change; the paper's is in test_resume.py, and `make soak` takes them all."""
 ALL = [
     pytest.param(name, marks=[] if name in FAMILIES else [pytest.mark.soak])
