@@ -53,10 +53,10 @@ class Job:
         where = ("--distributed", "--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", count)
         return [self.start("-m", "gacrl", *words, *where, "--process-id", k) for k in range(count)]
 
-    def finish(self, code: int = 0, seconds: float = 900) -> list[str]:
-        """What each said; all must end like that, in this time."""
+    def finish(self, *codes: int, seconds: float = 900) -> list[str]:
+        """What each said; they must end with these codes (none: all well), in this time."""
         said = [child.communicate(timeout=seconds)[0] for child in self.running]
-        assert [child.returncode for child in self.running] == [code] * len(said), "\n".join(said)
+        assert [child.returncode for child in self.running] == list(codes or [0] * len(said)), "\n".join(said)
         self.running.clear()
         return said
 
@@ -164,7 +164,7 @@ def test_a_process_that_dies_ends_the_job_and_others_go_on(
     job.running.clear()
 
     reached = checkpoint.newest(folder / "checkpoints")[0].env_steps
-    assert reached >= 60
+    assert reached >= 30, "one evaluation at most is ahead of its checkpoint"
     for path in (folder, tmp_path / "straight"):
         if path != folder:
             shutil.copytree(folder, path)
@@ -187,7 +187,7 @@ def test_a_whole_run_of_two_processes_stops_together_and_only_the_first_speaks(j
     running = job.together(2, "train", *TINY, "--env-steps", 100_000, "--out", folder)
     wait_for_lines(job, folder, 8)
     running[1].send_signal(signal.SIGTERM)
-    first, second = job.finish(130)
+    first, second = job.finish(130, 143)  # the second was told by the system, the first by the second
     assert "stopped at environment step" in first
     assert "run  " in first
     assert "run  " not in second
