@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from gacrl import config as configuration
 from gacrl import envs
 from gacrl.algorithm_config import AlgorithmConfig, GacrlPaperConfig, QLearningConfig
-from gacrl.config import EnvConfig, RunConfig
+from gacrl.config import CurriculumConfig, EnvConfig, RunConfig
 from gacrl.envs import scripted
 from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
@@ -65,6 +65,7 @@ def open_run(
     changed = replace(
         config,
         env=change(config.env),
+        curriculum=CurriculumConfig(),
         evaluation=replace(config.evaluation, horizon=None),
         algorithm=_without_experience(config.algorithm),
     )

@@ -1,6 +1,7 @@
 """Tasks that grow: gates, arenas and teams by hand, and one compiled program through all of it."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -12,7 +13,9 @@ from gacrl import config as configuration
 from gacrl.config import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.envs.spread import Spread
 from gacrl.errors import ConfigError
-from gacrl.training import curriculum, session
+from gacrl.play import open_run
+from gacrl.training import checkpoint, curriculum, session
+from gacrl.training.recorder import RunFolder
 from gacrl.types import Rollout
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -92,6 +95,14 @@ def test_a_team_grows_within_one_program():
         "evaluated with the whole team, without masks"
     )
     assert jax.tree.leaves(trainer.evaluate(state.learner, False, "monitor", 2))[0].shape == (1, 2)
+
+
+def test_a_team_that_grew_plays_with_fewer_than_it_began_with(tmp_path: Path):
+    config = replace(GROWING, curriculum=CurriculumConfig(num_agents_start=3))
+    folder = RunFolder.create(tmp_path / "run", config)
+    tensors = checkpoint.serialise(checkpoint.arrays(session.build(config).init((0,))))
+    checkpoint.save(folder.checkpoints, tensors, 0, configuration.fingerprint(config), {})
+    assert open_run(folder.path, lambda env: replace(env, num_agents=2)).env.num_agents == 2
 
 
 def test_what_cannot_grow_is_refused():
