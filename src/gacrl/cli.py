@@ -124,14 +124,16 @@ def _resume(words: list[str]) -> int:
 
 
 def _diagnose(asked: "Resume") -> int:
+    if asked.extend is not None:
+        raise UserError("--diagnose writes nothing: leave --extend out")
+    if asked.cluster.distributed:
+        raise UserError("--diagnose is done by one process: leave --distributed out")
     from gacrl.training import devices, recorder
 
     devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
     from gacrl.progress import TerminalWatcher, print_diagnosis
     from gacrl.training import diagnosis
 
-    if asked.extend is not None:
-        raise UserError("--diagnose writes nothing: leave --extend out")
     with TerminalWatcher() as terminal:
         found = diagnosis.diagnose(asked.run, terminal.watcher())
     print_diagnosis(found)

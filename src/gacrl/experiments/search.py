@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -276,10 +276,10 @@ def mean_value(spec: Spec, rows: Sequence[Mapping[str, Any]]) -> float:
 def conclude(spec: Spec, out: Path) -> Search:
     """Rank what was tried, and write `report.html`, `report.md`, `summary.json`, and the best trial's `best.json`."""
     sign = -1.0 if spec.maximize else 1.0
-    order: Callable[[Trial], Any] = lambda trial: (  # noqa: E731
-        trial.state != "finished",
-        math.inf if trial.value is None else sign * trial.value,
-    )
+
+    def order(trial: Trial) -> tuple[bool, float]:
+        return trial.state != "finished", math.inf if trial.value is None else sign * trial.value
+
     ranked = tuple(sorted(trials_in(spec, out), key=order))
     page = Page("Search")
     seeds = ", ".join(str(seed) for seed in spec.config.seeds)

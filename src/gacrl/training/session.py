@@ -137,7 +137,6 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
     watcher = watcher or Watcher()
     folder = RunFolder.open(path)
-    mesh(folder.config())
     with folder.locked() if leads() else nullcontext():
         config = folder.config()
         found = newest_checkpoint(folder, watcher.warn)
