@@ -16,6 +16,8 @@ from conftest import SCRIPTED_ROW
 
 import gacrl
 from gacrl import cli, config
+from gacrl import presets as presets_module
+from gacrl.algorithm_config import GacrlConfig
 from gacrl.experiments import paper_tables, scoring
 
 ROOT = Path(__file__).parent.parent
@@ -37,7 +39,7 @@ def room(tmp_path_factory, quick_start):
 
     def short(preset: config.RunConfig) -> config.RunConfig:
         algorithm = preset.algorithm
-        if isinstance(algorithm, config.GacrlConfig):
+        if isinstance(algorithm, GacrlConfig):
             algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500)
         return replace(
             preset,
@@ -54,7 +56,7 @@ def room(tmp_path_factory, quick_start):
 
     presets = {name: ("short", short(config.preset(name))) for name in ("paper", "gacrl")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(config, "PRESETS", MappingProxyType({**config.PRESETS, **presets}))
+        patch.setattr(presets_module, "PRESETS", MappingProxyType({**config.PRESETS, **presets}))
         patch.setattr(scoring, "score_run", few)
         patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         patch.chdir(tmp_path_factory.mktemp("readme"))

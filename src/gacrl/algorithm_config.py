@@ -219,6 +219,8 @@ class QLearningConfig(LearningConfig):
     monotonic mixer's units saturate far below it). Leaves the optimum where episodes have a fixed length."""
     double_q: bool = True
     """The online network chooses the action that the target network values."""
+    averaged: bool = False
+    """Play greedily with the target network, a running mean of the parameters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -282,7 +284,6 @@ class GacrlConfig(QLearningConfig):
     coverage_radius: Literal["0.1", "0.2", "0.5"] = "0.2"
     """Radius of the coverage that exploration follows."""
     averaged: bool = True
-    """Play greedily with the target network, a running mean of the parameters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -219,7 +219,7 @@ class Reproduce:
     out: Path = Path("runs/reproduce")
     """The folder of the runs and the report."""
     extended: bool = False
-    """Also train each algorithm with its own preset and budget on MPE2's task: millions of steps."""
+    """Also train them, and VDN, in earnest: MPE2's 25 steps, equal torso, symmetry, reward and number of steps."""
     json: bool = False
     """Make the last line of the output one JSON object."""
 

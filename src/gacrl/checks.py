@@ -1,4 +1,8 @@
-"""What settings are held to: a condition, or two bounds. A leaf: it imports no jax."""
+"""What settings are held to: a condition, two bounds, or names that are known. A leaf: it imports no jax."""
+
+import difflib
+from collections.abc import Mapping
+from typing import Any
 
 from gacrl.errors import ConfigError
 
@@ -18,6 +22,13 @@ def between(section: str, settings: object, low: int | float, high: int | float,
                 isinstance(value, int | float) and low <= value <= high,
                 f"{section}.{name} must be between {_shown(low)} and {_shown(high)}, not {value}",
             )
+
+
+def unknown(kind: str, name: str, known: Mapping[str, Any] | set[str] | list[str], hint: str = "") -> str:
+    """The sentence for a name that is not among the known ones, with the nearest of them."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
+    mend = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
+    return f"unknown {kind} {name!r}: {mend}" + (f" ({hint})" if hint else "")
 
 
 def _shown(bound: int | float) -> str:

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from gacrl import config as configuration
+from gacrl import envs
+from gacrl.algorithms.actions import choices
 from gacrl.cli import main
+from gacrl.config import CurriculumConfig, EnvConfig
 from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments import claims as claim_data
 from gacrl.experiments import comparisons, paper_tables, reproduce
@@ -20,6 +23,8 @@ from gacrl.experiments.comparisons import judge, judge_all
 from gacrl.experiments.evidence import Evidence, Reference, Series, blocks
 from gacrl.experiments.reproduce import at_paper_budget, plan
 from gacrl.experiments.study import DIVERGED, Planned
+from gacrl.networks.agent import acting_parameters, matched
+from gacrl.presets import GACRL_PARAMETERS
 from gacrl.training.recorder import RunFolder
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
@@ -309,7 +314,28 @@ def test_every_run_has_the_papers_steps_and_logs_each_50_episodes(tmp_path: Path
         assert (config.curriculum == paper.curriculum) == (config.env.reward == "paper") == (column == "paper")
     gacrl = {run.config.algorithm for (_, who), run in runs.items() if who == "GACRL"}
     assert gacrl == {configuration.preset("paper").algorithm}
-    assert {column for column, _ in plan(tmp_path, 2, extended=True)} == {"paper", "mpe2", "extended"}
+
+
+def test_the_extended_runs_differ_by_the_algorithm_alone(tmp_path: Path):
+    runs = {
+        who: run.config for (column, who), run in plan(tmp_path, 5, extended=True).items() if column == "extended"
+    }
+    assert set(runs) == {"GACRL", "QMIX", "VDN", "MAPPO", "IPPO"}
+    sizes: list[int] = []
+    for config in runs.values():
+        algorithm: Any = config.algorithm
+        assert (config.env, config.curriculum, config.seeds) == (
+            EnvConfig(reward="coverage"),
+            CurriculumConfig(),
+            (0, 1, 2, 3, 4),
+        )
+        assert config.num_updates * config.steps_per_update == 150_000
+        assert (algorithm.network.torso, algorithm.augment, algorithm.symmetric_play) == ("graph", True, True)
+        env = envs.make(config.env)
+        num_actions = choices(env).size
+        sizes.append(acting_parameters(env, matched(env, algorithm.network, num_actions), num_actions))
+    assert sizes[0] == GACRL_PARAMETERS
+    assert max(sizes) < 1.06 * min(sizes)
 
 
 def test_blocks_are_means_of_fifty_episodes_or_of_halves():
@@ -398,7 +424,7 @@ def test_the_command_writes_a_report_that_has_every_claim(
         "GACRL diverged when trained on MPE2&#x27;s reward (loss is nan)",
         "16 of the 16 printed means",
         "env.reset_on_collision",
-        "The four with the steps they need",
+        "The same with equal switches",
         "17.65, 0.16, 0.6",
     ):
         assert text in page, text

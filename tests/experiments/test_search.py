@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gacrl import config as configuration
+from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.cli import main
 from gacrl.config import RunConfig
 from gacrl.experiments import search, study
@@ -50,7 +51,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     rates: list[float] = []
 
     def start(config: RunConfig, out: Path, watcher: Watcher) -> Run:
-        assert not isinstance(config.algorithm, configuration.GacrlPaperConfig)
+        assert not isinstance(config.algorithm, GacrlPaperConfig)
         rate = config.algorithm.learning_rate
         rates.append(rate)
         folder = RunFolder.create(out, config)

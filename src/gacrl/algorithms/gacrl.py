@@ -68,7 +68,6 @@ def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Alg
         team_value=partial(central, actions) if config.critic == "central" else summed,
         exploration=_exploration(config, training.env_steps),
         auxiliary=auxiliary,
-        averaged=config.averaged,
     )
     return q_learning.make(config, env, training, parts)
 

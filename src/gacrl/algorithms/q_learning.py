@@ -51,8 +51,6 @@ class Parts(NamedTuple):
     exploration: Exploration
     auxiliary: Callable[[AgentOutput], Metrics]
     """Further terms of the loss, weighted already, from what the network put out; {} for none."""
-    averaged: bool = False
-    """Play greedily with the slow target network, a running mean of the parameters."""
 
 
 class Experience(NamedTuple):
@@ -155,7 +153,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         )
 
     def policy(learner: LearnerState, explore: bool) -> Policy:
-        network = learner.target if parts.averaged and not explore else learner.network
+        network = learner.target if config.averaged and not explore else learner.network
         level = parts.exploration.level(learner.exploration, learner.env_steps)
 
         def act(

@@ -24,9 +24,9 @@ Play = Literal["training", "sampled", "greedy"]
 Metrics = Mapping[str, Float[np.ndarray, "..."]]
 
 COLUMNS: Mapping[str, str] = MappingProxyType(
-    {"paper": "the paper's reward", "mpe2": "MPE2's reward", "extended": "its own budget"}
+    {"paper": "the paper's reward", "mpe2": "MPE2's reward", "extended": "equal switches"}
 )
-"""What the algorithms are trained on: the paper's reward and curriculum, MPE2's reward, or a task of their own."""
+"""What the algorithms are trained on: the paper's reward and curriculum, MPE2's reward, or MPE2's task in earnest."""
 FINAL_EPISODES = 50
 """What the paper's final metrics cover, and what a random policy is averaged over beside them."""
 

@@ -26,6 +26,11 @@ ALGORITHMS: Mapping[str, str] = MappingProxyType(
 )
 """The paper's names, and the presets that train them."""
 
+EXTENDED: Mapping[str, str] = MappingProxyType(
+    {"GACRL": "gacrl", "QMIX": "graph-qmix", "VDN": "graph-vdn", "MAPPO": "graph-mappo", "IPPO": "graph-ippo"}
+)
+"""The same as they should have been run, and VDN: torso, symmetry, reward, steps and parameters are equal."""
+
 _PPO: dict[str, Any] = {"training": {"num_envs": 10, "num_steps": 25}, "algorithm": {"learning_rate": 2e-3}}
 _AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
@@ -89,9 +94,8 @@ def plan(
             training = replace(config.training, env_steps=episodes * HORIZON)
             configs[column, who] = replace(config, num_seeds=seeds, training=training)
     if extended:
-        for who in ("gacrl", "qmix", "mappo", "ippo"):
-            if who in configuration.PRESETS:
-                configs["extended", who] = replace(configuration.preset(who), num_seeds=seeds)
+        for who, preset in EXTENDED.items():
+            configs["extended", who] = replace(configuration.preset(preset), num_seeds=seeds)
     return {
         (column, who): Planned(f"{who}, {evidence.COLUMNS[column]}", config, out / f"{column}-{who.lower()}")
         for (column, who), config in configs.items()
