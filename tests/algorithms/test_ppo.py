@@ -1,5 +1,6 @@
 """PPO: its formulas by hand and as rlax has them, its targets, its segments, and a first ratio of 1."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from scipy import special, stats
 from gacrl import rollout
 from gacrl.algorithm_config import IppoConfig, MappoConfig, NetworkConfig
 from gacrl.algorithms import ippo, mappo, ppo
+from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.objectives import clipped_surrogate, follow_returns, huber, no_returns
 from gacrl.algorithms.shared import mean_real, share_reward
 from gacrl.config import TrainingConfig
@@ -311,7 +313,13 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
         return original(network, sample, memory, *rest)
 
     monkeypatch.setattr(ppo, "loss", spy)
-    algorithm = mappo.make(config, SPREAD, TrainingConfig(env_steps=100, num_envs=4, num_steps=4))
+
+    def algorithm_with(**changes: Any) -> Algorithm:
+        return mappo.make(
+            replace(config, **changes), SPREAD, TrainingConfig(env_steps=100, num_envs=4, num_steps=4)
+        )
+
+    algorithm = algorithm_with()
     memory, params = algorithm.initial_memory(3), SPREAD.default_params()
     learner, other = (drawn_learner(algorithm, seed) for seed in (0, 1))
 
@@ -332,14 +340,20 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
     assert not experience.transitions.first[0].any() and experience.transitions.truncated.sum() == 4
     update = jax.jit(algorithm.update)
     _, metrics = update(learner, experience, jax.random.key(5))
-    assert metrics["ratio_clipped"] == 0.0 and abs(metrics["kl"]) < 1e-6
-    if augment:  # turned steps are asked about again, whoever acted
+    jax.effects_barrier()
+    steps, (sample, remembered) = experience.transitions, collected[0]
+    if augment:  # what is learned from is turned; what the choices were made with, and what they earned, stay
+        plain = algorithm_with(augment=False)
+        jax.jit(plain.update)(learner, experience, jax.random.key(5))
+        jax.effects_barrier()
+        for part in ("log_prob", "advantage", "target"):
+            np.testing.assert_array_equal(getattr(sample, part), getattr(collected[-1][0], part))
+        assert not np.array_equal(sample.observation.features, collected[-1][0].observation.features)
         return
+    assert metrics["ratio_clipped"] == 0.0 and abs(metrics["kl"]) < 1e-6
     _, metrics = update(other, experience, jax.random.key(5))
     assert metrics["ratio_clipped"] > 0.9
 
-    jax.effects_barrier()
-    steps, (sample, remembered) = experience.transitions, collected[0]
     expected = steps.reward[:-1] + steps.decision.extras["value"][1:]
     going_on = ~np.asarray(steps.truncated)[:-1]
     if not jax.tree.leaves(memory):  # every step is a segment

@@ -207,35 +207,6 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
 
         return act
 
-    def experience_of(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> Transition:
-        """The rollout, with choices for actions; turned by a symmetry for each environment, where that is asked for.
-
-        What the acting policy thinks is then asked again, of the turned world.
-        """
-        steps = rollout.transitions
-        steps = steps._replace(
-            observation=steps.observation._replace(action_mask=actions.mask(steps.observation.action_mask)),
-            decision=steps.decision._replace(action=steps.decision.extras["choice"]),
-        )
-        if not config.augment:
-            return steps
-        steps = turn_experience(env, steps, key)
-        memory = split_memory(rollout.first_memory)
-
-        def again(steps: Transition, memory: PpoMemory):
-            key = steps.decision.extras["key"]
-            acted, _ = unroll(learner.network.actor, steps.observation, steps.first, memory.actor, key)
-            value, _ = evaluate_critic(learner.network.critic, steps.observation, steps.first, memory.critic)
-            return log_policy(acted.head, steps.observation.action_mask), value
-
-        log_probs, value = jax.vmap(again, (1, 0), 1)(steps, memory)
-        extras = {
-            **steps.decision.extras,
-            "log_prob": taken(log_probs, steps.decision.action),
-            "value": learner.norm.denormalise(value),
-        }
-        return steps._replace(decision=steps.decision._replace(extras=extras))
-
     def targets(
         learner: LearnerState, steps: Transition, memory: PpoMemory
     ) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
@@ -265,8 +236,16 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
     def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
         turn_key, shuffle_key = jax.random.split(key)
         memory = split_memory(rollout.first_memory)
-        steps = experience_of(learner, rollout, turn_key)
+        steps = rollout.transitions
+        steps = steps._replace(
+            observation=steps.observation._replace(action_mask=actions.mask(steps.observation.action_mask)),
+            decision=steps.decision._replace(action=steps.decision.extras["choice"]),
+        )
         advantage, returns = targets(learner, steps, memory)
+        if (
+            config.augment
+        ):  # advantages and returns do not turn, nor does the probability that the choice was made with
+            steps = turn_experience(env, steps, turn_key)
         real = steps.observation.agent_mask
         norm = follow_returns(learner.norm, returns, real) if config.value_norm else learner.norm
         centre = mean_real(advantage, real)
