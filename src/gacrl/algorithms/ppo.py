@@ -107,7 +107,7 @@ def loss(
 
     def one(observation: Observation, first: Array, key: Array, memory: PpoMemory):
         acted, _ = unroll(network.actor, observation, first, memory.actor, key)
-        return acted.head, evaluate_critic(network.critic, observation, first, memory.critic)[0]
+        return acted.head, network.critic.unroll(observation, first, memory.critic)[0]
 
     logits, value = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
     log_probs = log_policy(logits, sample.observation.action_mask)
@@ -123,22 +123,6 @@ def loss(
     parts = {name: mean_real(values, real) for name, values in parts.items()}
     total = parts["loss_policy"] + hyper.vf_coef * parts["loss_critic"] - ent_coef * parts["entropy"]
     return total, parts
-
-
-def evaluate_critic(
-    critic: Critic, observation: Observation, first: Bool[Array, " L"], memory: Memory
-) -> tuple[Float[Array, "L N"], Memory]:
-    """Values along a segment of one environment, and the critic's memory after each step."""
-    if critic.memory is None:
-        return jax.vmap(lambda seen: critic(seen)[0])(observation), ()
-    fresh = critic.initial_memory(observation.features.shape[-2])
-
-    def step(memory: Memory, inputs: tuple[Observation, Array]):
-        seen, first = inputs
-        value, memory = critic(seen, jnp.where(first, fresh, memory))
-        return memory, (value, memory)
-
-    return jax.lax.scan(step, memory, (observation, first))[1]
 
 
 def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: View) -> Algorithm:
@@ -216,7 +200,7 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         def after(steps: Transition, memory: Memory) -> Float[Array, "T N"]:
             if critic.memory is None:
                 return jax.vmap(lambda seen: critic(seen)[0])(steps.next_observation)
-            _, memories = evaluate_critic(critic, steps.observation, steps.first, memory)
+            _, memories = critic.unroll(steps.observation, steps.first, memory)
             return jax.vmap(lambda seen, memory: critic(seen, memory)[0])(steps.next_observation, memories)
 
         next_value = learner.norm.denormalise(jax.vmap(after, (1, 0), 1)(steps, memory.critic))

@@ -4,6 +4,7 @@ Q-learning takes the head for the values of the actions, PPO for logits, and cri
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from gacrl.networks import torso as torsos
 from gacrl.networks.communication import Communication, Neighbourhood
 from gacrl.networks.encoder import Code
 from gacrl.networks.graph import audible, observed_adjacency
+from gacrl.networks.gru import Gru
 from gacrl.networks.layers import Linear, num_parameters
 from gacrl.types import Channel, Memory, Observation, PRNGKey
 
@@ -40,12 +42,20 @@ class AgentOutput(NamedTuple):
     """Negative evidence lower bound of the code, up to constants; 0 without a code."""
 
 
+class Seen(NamedTuple):
+    """What an agent network knows before it remembers."""
+
+    hidden: Float[Array, "N H"]
+    code: Float[Array, "N Z"] | None
+    code_loss: Float[Array, " N"] | float
+
+
 class AgentNetwork(eqx.Module):
     """Shared by all agents; for one environment at one step."""
 
     torso: torsos.Torso
     code: Code | None
-    memory: eqx.nn.GRUCell | None
+    memory: Gru | None
     communication: Communication
     head: Linear
     radius: float = eqx.field(static=True)
@@ -63,7 +73,7 @@ class AgentNetwork(eqx.Module):
         torso_key, code_key, memory_key, communication_key, head_key = jax.random.split(key, 5)
         self.torso = torsos.make(env, config, torso_key, gain)
         self.code = None if config.latent == "none" else Code(config, code_key)
-        self.memory = eqx.nn.GRUCell(config.width, config.width, key=memory_key) if config.recurrent else None
+        self.memory = Gru(config.width, memory_key) if config.recurrent else None
         self.communication = communication.make(config, communication_key, gain)
         self.head = Linear(config.width, num_outputs, head_key, head_gain)
         self.radius = config.radius
@@ -73,7 +83,7 @@ class AgentNetwork(eqx.Module):
         inbox = self.communication.empty_inbox(num_agents)
         if self.memory is None and isinstance(inbox, tuple):
             return ()
-        carry = () if self.memory is None else jnp.zeros((num_agents, self.memory.hidden_size))
+        carry = () if self.memory is None else self.memory.empty(num_agents)
         return AgentMemory(carry, inbox)
 
     def __call__(
@@ -85,28 +95,51 @@ class AgentNetwork(eqx.Module):
         temperature: Float[Array, ""] | float = 1.0,
     ) -> tuple[AgentOutput, Memory]:
         """Without a key nothing is drawn: the most likely symbols, DIAL's bits."""
-        channel = Channel() if channel is None else channel
-        adjacency = observed_adjacency(observation, self.radius)
-        near = Neighbourhood(audible(adjacency, channel), _offsets(observation))
         remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
-        hidden = self.torso(observation)
-        code, code_loss = None, 0.0
+        seen = self.see(observation, remembered.inbox, key, channel)
+        carry = self.remember(seen.hidden, remembered.carry)
+        output, inbox = self.say(
+            observation, seen if self.memory is None else seen._replace(hidden=carry), key, channel, temperature
+        )
+        return output, AgentMemory(carry, inbox) if isinstance(memory, AgentMemory) else ()
+
+    def see(
+        self, observation: Observation, inbox: Any, key: PRNGKey | None, channel: Channel | None = None
+    ) -> Seen:
+        """What comes before the memory: what is seen, its code, and what was heard of the step before."""
+        hidden, code, code_loss = self.torso(observation), None, 0.0
         if self.code is not None:
             code, hidden, code_loss = self.code(hidden, None if key is None else jax.random.fold_in(key, 2_000))
-        hidden = self.communication.hear(hidden, remembered.inbox, near, channel, key)
-        carry = remembered.carry
-        if self.memory is not None:
-            carry = hidden = jax.vmap(self.memory)(hidden, carry)
-        spoken = self.communication.speak(hidden, near, channel, key, temperature, code)
-        message = (
-            None if spoken.message is None else jnp.where(observation.agent_mask[:, None], spoken.message, 0.0)
-        )
-        output = AgentOutput(
-            self.head(spoken.hidden), spoken.hidden, message, adjacency, spoken.entropy, code_loss
-        )
-        if not isinstance(memory, AgentMemory):
-            return output, ()
-        return output, AgentMemory(carry, spoken.inbox)
+        _, near, channel = self._around(observation, channel)
+        return Seen(self.communication.hear(hidden, inbox, near, channel, key), code, code_loss)
+
+    def remember(self, hidden: Float[Array, "N H"], carry: Any) -> Any:
+        """The memory after the step; as it was for a network without one."""
+        return carry if self.memory is None else self.memory(hidden, carry)
+
+    def say(
+        self,
+        observation: Observation,
+        seen: Seen,
+        key: PRNGKey | None,
+        channel: Channel | None,
+        temperature: Float[Array, ""] | float,
+    ) -> tuple[AgentOutput, Any]:
+        """What comes after the memory: communication and head; and the inbox for the next step."""
+        adjacency, near, channel = self._around(observation, channel)
+        spoken = self.communication.speak(seen.hidden, near, channel, key, temperature, seen.code)
+        message = spoken.message
+        if message is not None:
+            message = jnp.where(observation.agent_mask[:, None], message, 0.0)
+        head = self.head(spoken.hidden)
+        return AgentOutput(head, spoken.hidden, message, adjacency, spoken.entropy, seen.code_loss), spoken.inbox
+
+    def _around(
+        self, observation: Observation, channel: Channel | None
+    ) -> tuple[Bool[Array, "N N"], Neighbourhood, Channel]:
+        channel = Channel() if channel is None else channel
+        adjacency = observed_adjacency(observation, self.radius)
+        return adjacency, Neighbourhood(audible(adjacency, channel), _offsets(observation)), channel
 
 
 def unroll(
@@ -119,11 +152,18 @@ def unroll(
 ) -> tuple[AgentOutput, Memory]:
     """The network over T steps of one environment: outputs, and the memory *after* each step, [T, …].
 
-    The memory starts anew where `first`. Without a memory all steps are computed at once.
+    The memory starts anew where `first`. What does not wait for the step before is computed for all steps at once.
     """
     if not isinstance(memory, AgentMemory):
         return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
     fresh = network.initial_memory(observations.features.shape[-2])
+    if network.memory is not None and not jax.tree.leaves(memory.inbox):
+        seen = jax.vmap(lambda observation, key: network.see(observation, (), key))(observations, keys)
+
+        carries = network.memory.unroll(seen.hidden, first, memory.carry)
+        say = partial(network.say, channel=None, temperature=temperature)
+        output, _ = jax.vmap(say)(observations, seen._replace(hidden=carries), keys)
+        return output, AgentMemory(carries, memory.inbox)
 
     def step(memory: Memory, inputs: tuple[Observation, Bool[Array, ""], Any]):
         seen, first, key = inputs

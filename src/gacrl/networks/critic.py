@@ -5,11 +5,12 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from gacrl.algorithm_config import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks import torso as torsos
+from gacrl.networks.gru import Gru
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.types import Memory, Observation, PRNGKey
 
@@ -37,7 +38,7 @@ class Critic(eqx.Module):
     torso: torsos.Torso
     world: Mlp | None
     merge: Linear | None
-    memory: eqx.nn.GRUCell | None
+    memory: Gru | None
     head: Linear
 
     def __init__(
@@ -50,18 +51,31 @@ class Critic(eqx.Module):
         by_vector = central and config.torso == "mlp"
         self.world = Mlp(state_size, (width,), world_key, gain) if by_vector else None
         self.merge = Linear(2 * width, width, merge_key, gain) if central else None
-        self.memory = eqx.nn.GRUCell(width, width, key=memory_key) if config.recurrent else None
+        self.memory = Gru(width, memory_key) if config.recurrent else None
         self.head = Linear(width, 1, head_key, gain)
 
     def initial_memory(self, num_agents: int) -> Memory:
-        return () if self.memory is None else jnp.zeros((num_agents, self.memory.hidden_size))
+        return () if self.memory is None else self.memory.empty(num_agents)
 
     def __call__(self, observation: Observation, memory: Memory = ()) -> tuple[Float[Array, " N"], Memory]:
+        hidden = self._see(observation)
+        if self.memory is not None:
+            memory = hidden = self.memory(hidden, memory)
+        return self.head(hidden)[:, 0], memory
+
+    def unroll(
+        self, observations: Observation, first: Bool[Array, " T"], memory: Memory
+    ) -> tuple[Float[Array, "T N"], Memory]:
+        """Values along T steps of one environment, and the memory after each step; it starts anew where `first`."""
+        hidden = jax.vmap(self._see)(observations)
+        if self.memory is not None:
+            memory = hidden = self.memory.unroll(hidden, first, memory)
+        return self.head(hidden)[..., 0], memory
+
+    def _see(self, observation: Observation) -> Float[Array, "N H"]:
         hidden = self.torso(observation)
         if self.merge is not None:
             mean = team_mean(hidden, observation) if self.world is None else self.world(global_state(observation))
             everyone = jnp.broadcast_to(mean, hidden.shape)
             hidden = jax.nn.relu(self.merge(jnp.concatenate([hidden, everyone], axis=-1)))
-        if self.memory is not None:
-            memory = hidden = jax.vmap(self.memory)(hidden, memory)
-        return self.head(hidden)[:, 0], memory
+        return hidden
