@@ -120,22 +120,31 @@ _GACRL_TEAMS = _gacrl(
     nearest_agents=12,
 )
 
-# GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm.
+# GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, the best of six trials
+# each (docs/tuning).
 _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
 
 
-def _graph_q(name: str, mixer: Literal["qmix", "vdn"]) -> RunConfig:
-    algorithm = QmixConfig(
-        network=_GRAPH, mixer=mixer, epsilon_steps=12_000, reward_norm=mixer == "qmix", **_LEARNER
-    )
+def _graph_q(name: str, mixer: Literal["qmix", "vdn"], **tuned: Any) -> RunConfig:
+    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, **{**_LEARNER, **tuned})
     return _dear(name, algorithm, EnvConfig(), _GACRL.training)
 
 
-def _graph_ppo(name: str, kind: type[PpoConfig]) -> RunConfig:
-    tuned = _ppo(kind)
-    algorithm = replace(tuned, network=_GRAPH, learning_rate=2e-3, **_SYMMETRY)
+def _graph_ppo(name: str, kind: type[PpoConfig], **tuned: Any) -> RunConfig:
+    algorithm = replace(_ppo(kind), network=_GRAPH, **_SYMMETRY, **tuned)
     return _dear(name, algorithm, EnvConfig(), replace(_GACRL.training, num_envs=10, num_steps=25))
 
+
+_GRAPH_VDN = _graph_q(
+    "graph-vdn", "vdn", learning_rate=3e-3, reward_norm=True, target_step=0.004, epsilon_steps=13_000
+)
+_GRAPH_QMIX = _graph_q("graph-qmix", "qmix", learning_rate=2.5e-3, target_step=0.018, epsilon_steps=7_000)
+_GRAPH_MAPPO = _graph_ppo(
+    "graph-mappo", MappoConfig, learning_rate=2.3e-3, update_epochs=4, num_minibatches=5, gamma=0.97
+)
+_GRAPH_IPPO = _graph_ppo(
+    "graph-ippo", IppoConfig, learning_rate=1.8e-3, update_epochs=9, num_minibatches=2, gamma=0.88
+)
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
@@ -147,11 +156,11 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
         ),
         "graph-vdn": (
             "VDN with GACRL's switches: entity graph, symmetry, coverage bonus",
-            _graph_q("graph-vdn", "vdn"),
+            _GRAPH_VDN,
         ),
-        "graph-qmix": ("QMIX with GACRL's switches", _graph_q("graph-qmix", "qmix")),
-        "graph-mappo": ("MAPPO with GACRL's switches", _graph_ppo("graph-mappo", MappoConfig)),
-        "graph-ippo": ("IPPO with GACRL's switches", _graph_ppo("graph-ippo", IppoConfig)),
+        "graph-qmix": ("QMIX with GACRL's switches", _GRAPH_QMIX),
+        "graph-mappo": ("MAPPO with GACRL's switches", _GRAPH_MAPPO),
+        "graph-ippo": ("IPPO with GACRL's switches", _GRAPH_IPPO),
         "qmix": ("QMIX: replay, double Q, a monotonic mixer", _QMIX),
         "vdn": ("VDN: the same learner, values summed", _VDN),
         "iql": ("IQL: the same learner, each agent for itself", _IQL),
