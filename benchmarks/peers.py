@@ -1,19 +1,27 @@
-"""What the benchmarks share: peers in environments of their own, processes that take turns, ratios.
+"""What the benchmarks share: peers in environments of their own, their programs, processes that take turns, ratios.
 
 A peer lives under `.bench/NAME`, made at the first call. One that cannot be installed is said so, and skipped.
 Times are CPU seconds of one thread on one core, so that other work on the machine counts as little as it can; the
 figures are ratios of two sides that took turns.
 """
 
+import contextlib
+import importlib
 import json
 import os
 import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+try:
+    from benchmarl.experiment import Callback
+except ImportError:  # in everyone else's environment
+    Callback = object
 
 HERE = Path(__file__).resolve().parent
 ROOMS = HERE.parent / ".bench"
@@ -21,8 +29,16 @@ TORCH = "torch==2.13.0"
 PACKAGES = {
     "torch": (TORCH, "mpe2", "numpy"),
     "jaxmarl": ("jaxmarl==0.2.0", "distrax", "flashbax", "hydra-core", "omegaconf", "wandb"),
-    "benchmarl": (TORCH, "benchmarl==1.5.2", "vmas==1.5.2"),
+    "benchmarl": (TORCH, "benchmarl==1.5.2", "vmas==1.5.2", "pettingzoo==1.24.3", "pygame"),
 }
+BASELINES = {
+    "ippo": ("IPPO", "ippo_ff_mpe", "ippo_ff_mpe.yaml"),
+    "mappo": ("MAPPO", "mappo_rnn_mpe", "mappo_homogenous_rnn_mpe.yaml"),
+    "vdn-pqn": ("QLearning", "pqn_vdn_rnn", "alg/pqn_vdn_rnn_mpe.yaml"),
+    "vdn-pqn-ff": ("QLearning", "pqn_vdn_ff", "alg/pqn_vdn_ff_mpe.yaml"),
+    "qmix": ("QLearning", "qmix_rnn", "alg/ql_rnn_mpe.yaml"),
+}
+"""JaxMARL's, which are not in its package: folder, script and configuration below `baselines` in its repository."""
 ONE_THREAD = dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
@@ -42,6 +58,54 @@ def python_of(peer: str) -> str | None:
     reason = (done.stderr.strip() or "no reason given").splitlines()[-1]
     print(f"{peer} cannot be installed here and is left out: {reason}", flush=True)
     return None
+
+
+def jaxmarl_baseline(algorithm: str, checkout: str, steps: int) -> tuple[Any, dict[str, Any], Any]:
+    """A baseline of JaxMARL as shipped but for its steps: module, configuration, and training, a function of a key."""
+    import wandb
+    import yaml
+
+    folder, script, config = BASELINES[algorithm]
+    place = Path(checkout) / "baselines" / folder
+    sys.path.insert(0, str(place))
+    module = importlib.import_module(script)
+    said: dict[str, Any] = yaml.safe_load((place / "config" / config).read_text())
+    said = {name: float(value) if name == "LR" else value for name, value in said.items()}
+    said |= {"TOTAL_TIMESTEPS": steps, "WANDB_MODE": "disabled", "TEST_DURING_TRAINING": False}
+    wandb.init(mode="disabled")
+    environment = [module.env_from_config(said)[0]] if folder == "QLearning" else []
+    return module, said, module.make_train(said, *environment)
+
+
+class Enough(Exception):
+    """All that is measured has been."""
+
+
+def benchmarl_run(task: Any, algorithm: str, callback: Any, seed: int, **settings: Any) -> Any:
+    """BenchMARL's experiment at its defaults but these settings, until its end or the callback's `Enough`."""
+    from benchmarl import algorithms
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models.mlp import MlpConfig
+
+    config = ExperimentConfig.get_from_yaml()
+    config.loggers, config.evaluation, config.render, config.create_json = [], False, False, False
+    for name, value in settings.items():
+        setattr(config, name, value)
+    kind = {"ippo": "IppoConfig", "mappo": "MappoConfig", "qmix": "QmixConfig"}[algorithm]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        config.save_folder = folder
+        experiment = Experiment(
+            task=task,
+            algorithm_config=getattr(algorithms, kind).get_from_yaml(),
+            model_config=MlpConfig.get_from_yaml(),
+            critic_model_config=MlpConfig.get_from_yaml(),
+            seed=seed,
+            config=config,
+            callbacks=[callback],
+        )
+        with contextlib.suppress(Enough):
+            experiment.run()
+    return experiment
 
 
 class Side:
