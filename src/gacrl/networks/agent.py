@@ -97,10 +97,11 @@ class AgentNetwork(eqx.Module):
         """Without a key nothing is drawn: the most likely symbols, DIAL's bits."""
         remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
         seen = self.see(observation, remembered.inbox, key, channel)
-        carry = self.remember(seen.hidden, remembered.carry)
-        output, inbox = self.say(
-            observation, seen if self.memory is None else seen._replace(hidden=carry), key, channel, temperature
-        )
+        carry = remembered.carry
+        if self.memory is not None:
+            carry = self.memory(seen.hidden, carry)
+            seen = seen._replace(hidden=carry)
+        output, inbox = self.say(observation, seen, key, channel, temperature)
         return output, AgentMemory(carry, inbox) if isinstance(memory, AgentMemory) else ()
 
     def see(
@@ -112,10 +113,6 @@ class AgentNetwork(eqx.Module):
             code, hidden, code_loss = self.code(hidden, None if key is None else jax.random.fold_in(key, 2_000))
         _, near, channel = self._around(observation, channel)
         return Seen(self.communication.hear(hidden, inbox, near, channel, key), code, code_loss)
-
-    def remember(self, hidden: Float[Array, "N H"], carry: Any) -> Any:
-        """The memory after the step; as it was for a network without one."""
-        return carry if self.memory is None else self.memory(hidden, carry)
 
     def say(
         self,
@@ -156,14 +153,13 @@ def unroll(
     """
     if not isinstance(memory, AgentMemory):
         return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
-    fresh = network.initial_memory(observations.features.shape[-2])
     if network.memory is not None and not jax.tree.leaves(memory.inbox):
         seen = jax.vmap(lambda observation, key: network.see(observation, (), key))(observations, keys)
-
         carries = network.memory.unroll(seen.hidden, first, memory.carry)
         say = partial(network.say, channel=None, temperature=temperature)
         output, _ = jax.vmap(say)(observations, seen._replace(hidden=carries), keys)
         return output, AgentMemory(carries, memory.inbox)
+    fresh = network.initial_memory(observations.features.shape[-2])
 
     def step(memory: Memory, inputs: tuple[Observation, Bool[Array, ""], Any]):
         seen, first, key = inputs
