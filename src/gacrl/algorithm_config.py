@@ -106,7 +106,7 @@ class NetworkConfig:
     nearest_landmarks: int | None = None
     """The graph torso looks at this many nearest landmarks; none: all in sight."""
     nearest_agents: int | None = None
-    """And at this many nearest other agents."""
+    """And at this many nearest other agents; symbols are heard from as many."""
     parameters: int | None = None
     """Choose the width so that the acting network has about this many parameters; none: take the width."""
 

@@ -149,6 +149,28 @@ def test_nobody_outside_the_radius_is_heard(kind: str):
         np.testing.assert_array_equal(before[2], np.maximum(net.decode.bias, 0))
 
 
+@pytest.mark.parametrize(
+    "channel", [Channel(), Channel(symbol_map=jnp.tile(jnp.roll(jnp.eye(3), 1, 0), (6, 1, 1)))]
+)
+def test_only_the_nearest_are_heard(channel: Channel):
+    """As the graph of everyone's two nearest neighbours is; who is nearest and out of reach does not count."""
+    place_key, said_key = jax.random.split(jax.random.key(0))
+    positions, said = jax.random.uniform(place_key, (6, 2)), jax.random.normal(said_key, (6, 8))
+    offsets = positions[None] - positions[:, None]
+    adjacency = (jnp.ones((6, 6), bool) & ~jnp.eye(6, dtype=bool)).at[0, 1].set(False)
+    distance = jnp.where(adjacency, jnp.square(offsets).sum(-1), jnp.inf)
+    two_nearest = adjacency & (distance <= jnp.sort(distance, axis=1)[:, 1:2])
+
+    def heard(net: Any, graph: jax.Array) -> jax.Array:
+        return net.speak(said, Neighbourhood(graph, offsets), channel, jax.random.key(1), 1.0).hidden
+
+    limited, everyone = talk("discrete", rounds=2, nearest_agents=2), talk("discrete", rounds=2)
+    np.testing.assert_allclose(heard(limited, adjacency), heard(everyone, two_nearest), atol=1e-6)
+    assert np.abs(heard(limited, adjacency) - heard(everyone, adjacency)).max() > 1e-3
+    many = talk("discrete", rounds=2, nearest_agents=5)
+    np.testing.assert_allclose(heard(many, adjacency), heard(everyone, adjacency), atol=1e-6)
+
+
 # Gradients.
 
 

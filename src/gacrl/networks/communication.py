@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.algorithm_config import NetworkConfig
 from gacrl.networks.graph import attend, with_length
@@ -129,6 +129,8 @@ class Symbols(Silence):
     The first round's symbol is made of the agent's code, where it has one, as the paper's is of its latent; those
     of later rounds of what it knows by then. A receiver knows where the speaker stands: an edge's embedding is of
     the symbol and the offset. Over the neighbours: the mean, weighted by the receiver's attention.
+
+    With `nearest_agents` each agent hears its nearest neighbours alone, and the cost grows with N · nearest_agents.
     """
 
     encode: tuple[Linear, ...]
@@ -136,6 +138,7 @@ class Symbols(Silence):
     attention: tuple[Linear, ...]
     merge: tuple[Linear, ...]
     straight_through: bool = eqx.field(static=True)
+    nearest: int | None = eqx.field(static=True)
 
     def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, narrow, symbols = config.width, config.width // 2, config.vocabulary
@@ -147,6 +150,7 @@ class Symbols(Silence):
         self.attention = tuple(Linear(width + narrow, 1, k, gain) for k in attention)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
         self.straight_through = config.communication == "discrete"
+        self.nearest = config.nearest_agents
 
     def speak(
         self,
@@ -157,8 +161,8 @@ class Symbols(Silence):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        where = with_length(near.offsets)
-        num_agents, message, entropy = hidden.shape[0], None, jnp.zeros(hidden.shape[0])
+        edges, speakers = _edges(near, self.nearest)
+        where, message, entropy = with_length(edges.offsets), None, jnp.zeros(hidden.shape[0])
         for number, (encode, edge, attention, merge) in enumerate(
             zip(self.encode, self.edge, self.attention, self.merge, strict=True)
         ):
@@ -170,10 +174,11 @@ class Symbols(Silence):
             else:
                 noise = jax.random.gumbel(jax.random.fold_in(key, number), logits.shape)
                 message = gumbel_softmax(logits, noise, temperature, self.straight_through)
-            received = edge(jnp.concatenate([_received(message, channel, key), where], axis=-1))  # [N N H/2]
-            receiver = jnp.broadcast_to(hidden[:, None, :], (num_agents, num_agents, hidden.shape[-1]))
+            symbols = _received(message, channel, key, speakers)
+            received = edge(jnp.concatenate([symbols, where], axis=-1))  # [N K H/2]
+            receiver = jnp.broadcast_to(hidden[:, None, :], (*received.shape[:2], hidden.shape[-1]))
             score = attention(jnp.concatenate([receiver, received], axis=-1))[..., 0]
-            heard = attend(received, jnp.where(near.adjacency, score, -jnp.inf))
+            heard = attend(received, jnp.where(edges.adjacency, score, -jnp.inf))
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
         return Spoken(hidden, message, (), entropy)
 
@@ -196,12 +201,27 @@ def discretise_regularise(message: Float[Array, "N V"], key: PRNGKey | None, noi
     return jax.nn.sigmoid(message + noise * jax.random.normal(key, message.shape))
 
 
-def _received(message: Float[Array, "N V"], channel: Channel, key: PRNGKey | None) -> Float[Array, "N N V"]:
-    """Entry [i, j]: j's message as it reaches i."""
+def _edges(near: Neighbourhood, nearest: int | None) -> tuple[Neighbourhood, Int[Array, "N K"] | None]:
+    """The edges to each agent from its nearest neighbours, and who those are; all edges and None for no limit."""
+    if nearest is None or nearest >= near.adjacency.shape[0]:
+        return near, None
+    squared = jnp.where(near.adjacency, jnp.square(near.offsets).sum(-1), jnp.inf)
+    speakers = jax.lax.top_k(-squared, nearest)[1]
+    offsets = jnp.take_along_axis(near.offsets, speakers[..., None], axis=1)
+    return Neighbourhood(jnp.take_along_axis(near.adjacency, speakers, axis=1), offsets), speakers
+
+
+def _received(
+    message: Float[Array, "N V"], channel: Channel, key: PRNGKey | None, speakers: Int[Array, "N K"] | None = None
+) -> Float[Array, "N K V"]:
+    """Entry [i, k]: the message of i's k-th speaker as it reaches i; of all agents for None."""
     if channel == Channel():
+        if speakers is not None:
+            return message[speakers]
         return jnp.broadcast_to(message[None], (message.shape[0], *message.shape))
     key = None if key is None else jax.random.fold_in(key, 1_000)
-    return jnp.moveaxis(transmit(message.T, channel, key)[0], 0, -1)
+    received = jnp.moveaxis(transmit(message.T, channel, key)[0], 0, -1)
+    return received if speakers is None else jnp.take_along_axis(received, speakers[..., None], axis=1)
 
 
 def _mean(received: Float[Array, "N N V"], adjacency: Bool[Array, "N N"]) -> Float[Array, "N V"]:
