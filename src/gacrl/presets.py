@@ -102,22 +102,24 @@ def _dear(name: str, algorithm: AlgorithmConfig, env: EnvConfig, training: Train
     return RunConfig(algorithm=algorithm, env=env, training=training, evaluation=evaluation, preset=name)
 
 
-def _gacrl(name: str, env: EnvConfig, env_steps: int = 112_500, **network: Any) -> RunConfig:
+_GACRL_NETWORK = NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete", rounds=2)
+
+
+def _gacrl(name: str, env: EnvConfig, env_steps: int = 112_500, **changes: Any) -> RunConfig:
     """GACRL as docs/design.md came to it."""
-    seen = NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete", rounds=2, **network)
+    settings: dict[str, Any] = {"network": _GACRL_NETWORK, **_LEARNER, **changes}
     training = TrainingConfig(env_steps=env_steps, num_envs=25, num_steps=1)
-    return _dear(name, GacrlConfig(network=seen, **_LEARNER), env, training)
+    return _dear(name, GacrlConfig(**settings), env, training)
 
 
-_GACRL = _gacrl("gacrl", EnvConfig(), env_steps=150_000)
+_GACRL = _gacrl("gacrl", EnvConfig(), env_steps=150_000, learning_rate=3e-3, target_step=0.004, reward_norm=True)
 _GACRL_112K = _gacrl("gacrl-112k", EnvConfig(max_cycles=75))
 # Entities as dense as in the standard task: the arena's side grows with the root of their number.
 _GACRL_TEAMS = _gacrl(
     "gacrl-teams",
     EnvConfig(num_agents=5, arena_scale=1.291, max_cycles=75),
     env_steps=150_000,
-    nearest_landmarks=8,
-    nearest_agents=12,
+    network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
 
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, the best of six trials
