@@ -155,14 +155,14 @@ def _extended(page: Page, evidence: Evidence) -> None:
     page.table(("who", "played", "environment steps a seed", *shown.values()), rows)
     if "GACRL" not in runs:
         return
-    page.text("How likely a seed of GACRL ends above a seed of the other, greedy, final coverage 0.1:")
-    own = runs["GACRL"].final["greedy"]["coverage_final_0.1"]
+    page.text("How likely a seed of GACRL, greedy, ends above a seed of the other:")
+    own, judged_by = runs["GACRL"].final["greedy"], ("return_agent_mean", "coverage_final_0.1")
     rows = []
     for who, series in runs.items():
         if who != "GACRL":
-            ahead = probability_of_improvement(own, series.final["greedy"]["coverage_final_0.1"])
-            rows.append([who, f"{ahead.point:.2f} [{ahead.low:.2f}, {ahead.high:.2f}]"])
-    page.table(("against", "probability of improvement"), rows)
+            ahead = [probability_of_improvement(own[name], series.final["greedy"][name]) for name in judged_by]
+            rows.append([who, *(f"{p.point:.2f} [{p.low:.2f}, {p.high:.2f}]" for p in ahead)])
+    page.table(("against", *(shown[name] for name in judged_by)), rows)
 
 
 def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
