@@ -2,8 +2,8 @@
 
     python benchmarks/scaling.py [--core 0] [--json]
 
-Time: seconds = a + b · gradient steps + c · GFLOP + d · GB. GFLOP are the matrix products, counted from the jaxpr; GB is
-what all other operations read and write, likewise. The four numbers are this machine's: least squares of relative
+Time: seconds = a + b · gradient steps + c · GFLOP + d · GB. GFLOP are the matrix products, counted from the jaxpr; GB
+is what all other operations read and write, likewise. The four numbers are this machine's: least squares of relative
 errors, none below 0. Memory: what the state holds, counted from shapes, and e · GB of one gradient step, against what
 XLA plans for the whole program. Teams, environments, widths, batches and vocabularies are varied; every fourth point
 is held out. CPU time of one thread on one core.

@@ -138,7 +138,7 @@ def test_an_episode_is_settled_once():
     np.testing.assert_array_equal(again, modes)
 
 
-@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("continuous", [pytest.param(False, marks=pytest.mark.soak), True])
 def test_it_learns_from_its_replay_and_acts_as_the_task_wants(continuous: bool):
     env = Spread(num_agents=2, num_landmarks=2, max_cycles=4, continuous_actions=continuous)
     algorithm = algorithms.make(SMALL, env, TRAINING)

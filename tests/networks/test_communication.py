@@ -161,6 +161,7 @@ def test_only_the_nearest_are_heard(channel: Channel):
     distance = jnp.where(adjacency, jnp.square(offsets).sum(-1), jnp.inf)
     two_nearest = adjacency & (distance <= jnp.sort(distance, axis=1)[:, 1:2])
 
+    @eqx.filter_jit
     def heard(net: Any, graph: jax.Array) -> jax.Array:
         return net.speak(said, Neighbourhood(graph, offsets), channel, jax.random.key(1), 1.0).hidden
 

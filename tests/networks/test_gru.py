@@ -27,8 +27,8 @@ def test_a_step_is_that_of_equinox():
 
 def test_unrolled_it_is_step_by_step_and_forgets_where_an_episode_begins():
     first = jnp.array([False, False, True, False, True, False])
-    memory, after = MEMORY, []
+    memory, after, step = MEMORY, [], eqx.filter_jit(GRU)
     for x, begins in zip(X, first, strict=True):
-        memory = GRU(x, GRU.empty(3) if begins else memory)
+        memory = step(x, GRU.empty(3) if begins else memory)
         after.append(memory)
     np.testing.assert_allclose(GRU.unroll(X, first, MEMORY), jnp.stack(after), atol=1e-6)

@@ -32,7 +32,12 @@ from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments import paper_tables, scoring
 from gacrl.training import checkpoint, session
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [
+    pytest.mark.usefixtures("quick_start"),
+    pytest.mark.xdist_group("runs"),
+    # Whatever thread draws from `random` while a strategy runs, it is none of ours.
+    pytest.mark.filterwarnings("ignore:Do not use the `random` module inside strategies"),
+]
 
 FEW = int(os.environ.get("GACRL_FUZZ", "25"))
 MANY = 25 * FEW
