@@ -21,6 +21,7 @@ from gacrl.errors import UserError
 _PROBES = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 """A silent host is probed every second and given up after the third that is not answered."""
 _HELLO_SECONDS = 5.0
+_FAREWELL_SECONDS = 2.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class Peers:
         self._lines = lines
         self._ending = threading.Lock()
         self._left = {peer: threading.Event() for peer in lines}
+        self._heard = {peer: threading.Event() for peer in lines}
         for peer in lines:
             threading.Thread(target=self._listen, args=(peer,), daemon=True).start()
 
@@ -84,10 +86,16 @@ class Peers:
         self._say(mend=mend)
 
     def leave(self) -> None:
-        """This process has done its part. Process 0 goes at once, the others when it has."""
+        """This process has done its part. Process 0 goes when the others have heard so, the others when it has.
+
+        A line that closes with something unread resets, and what its other end had not read yet is lost.
+        """
         self._say(left=True)
         if self.place.process:
             self._left[0].wait()
+        end = time.monotonic() + _FAREWELL_SECONDS
+        for heard in self._heard.values() if self.place.process == 0 else ():
+            heard.wait(max(end - time.monotonic(), 0.0))
 
     def end(self, because: str, code: int) -> NoReturn:
         """End the whole job; this process with that code, and without waiting for anything that hangs."""
@@ -109,7 +117,11 @@ class Peers:
             if "mend" in words:
                 self.mend = lambda mend=str(words["mend"]): mend
             if "left" in words:
+                self._lines[peer].say(heard=True)
                 self._left[peer].set()
+            if "heard" in words:
+                self._heard[peer].set()
+        self._heard[peer].set()  # or never will
         if not self._left[peer].is_set():
             self.end(f"process {peer} of {self.place.count} has died, and with it the job: {self.mend()}", 1)
 
