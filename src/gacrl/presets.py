@@ -95,7 +95,7 @@ _LEARNER: dict[str, Any] = {
 }
 """Q-learning where environment steps are dear: an update of ten gradient steps after every 25 of them."""
 _SWIFT: dict[str, Any] = {"learning_rate": 3e-3, "reward_norm": True, "target_step": 0.004}
-"""What VDN learns best with, and QMIX at all; `gacrl` seems to, but ten seeds of it are still to be trained."""
+"""What VDN learns best with; `gacrl` seems to, but ten seeds of it are still to be trained."""
 
 
 def _dear(name: str, algorithm: AlgorithmConfig, env: EnvConfig, training: TrainingConfig) -> RunConfig:
@@ -125,7 +125,7 @@ _GACRL_TEAMS = _gacrl(
 )
 
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, tuned in six trials
-# (docs/tuning). QMIX has VDN's settings: those of its best trial collapsed in two of five fresh seeds.
+# (docs/tuning). QMIX, which has VDN's settings, collapses in some seeds with them as with those of its best trial.
 _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
 
 
