@@ -10,8 +10,6 @@ measured alone, at its own shape, and added up. CPU time of one thread on one co
 import argparse
 import json
 import os
-import statistics
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +25,7 @@ def measure(preset: str, num_envs: int | None) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
     from products import Product, alone, products, total
+    from updates import timed
 
     from gacrl import config
     from gacrl.training import session
@@ -35,18 +34,7 @@ def measure(preset: str, num_envs: int | None) -> dict[str, float]:
     if num_envs is not None:
         run = replace(run, training=replace(run.training, num_envs=num_envs))
     trainer = session.build(run)
-    warm = -(-getattr(run.algorithm, "learning_starts", 0) // run.steps_per_update) + 1
-    state, _ = trainer.chunk(trainer.init((0,)), warm)
-
-    def turn(updates: int) -> float:
-        nonlocal state
-        begun = time.process_time()
-        state, report = trainer.chunk(state, updates)
-        jax.block_until_ready(report)
-        return (time.process_time() - begun) / updates
-
-    updates = max(1, round(SECONDS / turn(1)))
-    taken = statistics.median(turn(updates) for _ in range(3))
+    taken, _ = timed(trainer, run, SECONDS)
     one = jax.eval_shape(trainer.init_member, jax.random.key(0), trainer.algorithm.hyper)
     found = products(jax.make_jaxpr(trainer.chunk_of_one)(one, jnp.int32(1)).jaxpr)
     large = Product((512, 512), (512, 512), (((1,), (0,)), ((), ())))

@@ -13,8 +13,6 @@ import argparse
 import json
 import math
 import os
-import statistics
-import time
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -92,22 +90,13 @@ def cost(point: dict[str, int]) -> Cost:
     import jax
     import jax.numpy as jnp
     from products import products, total
+    from updates import timed
 
     from gacrl.training import memory, session
 
     run = settings(**point)
     trainer = session.build(run)
-    state, _ = trainer.chunk(trainer.init((0,)), -(-run.algorithm.learning_starts // run.steps_per_update) + 1)
-
-    def turn(updates: int) -> float:
-        nonlocal state
-        begun = time.process_time()
-        state, report = trainer.chunk(state, updates)
-        jax.block_until_ready(report)
-        return (time.process_time() - begun) / updates
-
-    updates = max(1, round(SECONDS / turn(1)))
-    taken = statistics.median(turn(updates) for _ in range(3))
+    taken, state = timed(trainer, run, SECONDS)
     one = jax.eval_shape(trainer.init_member, jax.random.key(0), trainer.algorithm.hyper)
     jaxpr = jax.make_jaxpr(trainer.chunk_of_one)(one, jnp.int32(1)).jaxpr
     plan = trainer.chunk.lower(state, jnp.int32(1)).compile().memory_analysis()

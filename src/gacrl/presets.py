@@ -94,8 +94,6 @@ _LEARNER: dict[str, Any] = {
     "updates": 10,
 }
 """Q-learning where environment steps are dear: an update of ten gradient steps after every 25 of them."""
-_SWIFT: dict[str, Any] = {"learning_rate": 3e-3, "reward_norm": True, "target_step": 0.004}
-"""What VDN learns best with; `gacrl` seems to, but ten seeds of it are still to be trained."""
 
 
 def _dear(name: str, algorithm: AlgorithmConfig, env: EnvConfig, training: TrainingConfig) -> RunConfig:
@@ -130,8 +128,9 @@ _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
 
 
 def _graph_q(name: str, mixer: Literal["qmix", "vdn"]) -> RunConfig:
-    settings: dict[str, Any] = {**_LEARNER, **_SWIFT}
-    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, epsilon_steps=13_000, **settings)
+    tuned = {"learning_rate": 3e-3, "reward_norm": True, "target_step": 0.004, "epsilon_steps": 13_000}
+    settings: dict[str, Any] = {**_LEARNER, **tuned}
+    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, **settings)
     return _dear(name, algorithm, EnvConfig(), _GACRL.training)
 
 

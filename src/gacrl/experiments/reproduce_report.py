@@ -167,7 +167,8 @@ def _extended(page: Page, evidence: Evidence) -> None:
 
 def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
     page.heading("How this was made")
-    page.code(f"gacrl reproduce --seeds {seeds} --episodes {episodes}")
+    extended = any(column == "extended" for column, _ in evidence.series)
+    page.code(f"gacrl reproduce --seeds {seeds} --episodes {episodes}" + " --extended" * extended)
     rows = [
         [
             who,
