@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import TinyRun
 from PIL import Image
 
+from gacrl import cli, envs, play
 from gacrl import config as configuration
-from gacrl import envs, play
 from gacrl.cli import main
 from gacrl.envs import scripted
 from gacrl.evaluation import mpe2
@@ -240,6 +241,13 @@ def test_a_damaged_checkpoint_is_passed_over_and_none_is_refused(
     shutil.rmtree(newest)
     shutil.rmtree(older)
     assert "is missing" in refused("evaluate", copy)
+
+
+def test_a_device_without_memory_left_is_told(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(cli._COMMANDS, "presets", lambda words: jnp.zeros(2**46))
+    said = refused("presets")
+    assert "memory is full" in said
+    assert "281474976710656 bytes): take fewer seeds" in said
 
 
 def no_space(*_: object) -> None:

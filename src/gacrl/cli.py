@@ -75,6 +75,16 @@ def main(words: Sequence[str] | None = None) -> int:
         name = f" {error.filename}" if error.filename else ""
         print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
         return 2
+    except RuntimeError as error:  # JAX's own; its class would have to be imported
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        said = str(error).partition("\n")[0].partition(": ")[2].rstrip(" .")
+        print(
+            f"gacrl: the device's memory is full ({said}): take fewer seeds, environments or agents, or end what else "
+            "is using it",
+            file=sys.stderr,
+        )
+        return 2
     except KeyboardInterrupt:
         print("gacrl: interrupted", file=sys.stderr)
         return 130
@@ -249,7 +259,7 @@ def _compare(words: list[str]) -> int:
     from gacrl import arguments
 
     asked = arguments.parse(arguments.Compare, words, "compare")
-    from gacrl.experiments import compare, compare_report
+    from gacrl.experiments import compare, compare_data, compare_report
 
     files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval]
     for path in files:
@@ -261,10 +271,10 @@ def _compare(words: list[str]) -> int:
     if asked.out is not None:
         print(f"page       {compare_report.write_page(comparison, asked.out)}")
     if asked.marl_eval is not None:
-        asked.marl_eval.write_text(json.dumps(compare.to_marl_eval(comparison)) + "\n", encoding="utf-8")
+        asked.marl_eval.write_text(json.dumps(compare_data.to_marl_eval(comparison)) + "\n", encoding="utf-8")
         print(f"marl-eval  {asked.marl_eval}")
     if asked.json:
-        print(json.dumps(compare.to_dict(comparison)))
+        print(json.dumps(compare_data.to_dict(comparison)))
     return 0
 
 

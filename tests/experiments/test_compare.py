@@ -14,7 +14,8 @@ from gacrl import config as configuration
 from gacrl.cli import main
 from gacrl.config import RunConfig
 from gacrl.evaluation import statistics
-from gacrl.experiments.compare import Comparison, Pair, compare, to_dict, to_marl_eval
+from gacrl.experiments.compare import Comparison, Pair, compare
+from gacrl.experiments.compare_data import to_dict, to_marl_eval
 
 REFERENCES = {
     who: {"return_agent_mean": value, "coverage_final_0.1": coverage, "collisions": 1.0}

@@ -301,7 +301,7 @@ def scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[...,
 def versions() -> dict[str, str]:
     """What produced a run: packages, Python, and the commit where the source is a git checkout."""
     packages = ("gacrl", "jax", "jaxlib", "equinox", "optax", "numpy", "mpe2")
-    found = {name: metadata.version(name) for name in packages}
+    found = {name: _version(name) for name in packages}
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
         done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
@@ -309,6 +309,13 @@ def versions() -> dict[str, str]:
         return {**found, "python": platform.python_version()}
     commit = {"git_commit": done.stdout.strip()} if done.returncode == 0 else {}
     return {**found, "python": platform.python_version(), **commit}
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # imported from a folder of sources that was never installed
+        return "not installed"
 
 
 def _member_shapes(trainer: Trainer) -> TrainState:
