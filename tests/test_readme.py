@@ -40,7 +40,7 @@ def room(tmp_path_factory, quick_start):
     def short(preset: config.RunConfig) -> config.RunConfig:
         algorithm = preset.algorithm
         if isinstance(algorithm, GacrlConfig):
-            algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500)
+            algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500, symmetric_play=False)
         return replace(
             preset,
             algorithm=algorithm,

@@ -77,13 +77,15 @@ _COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds
 _DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
 
 
-GACRL_PARAMETERS = 11_144
+GACRL_PARAMETERS = 12_102
 """Of the acting network of `gacrl`, for three agents."""
 _SYMMETRY: dict[str, Any] = {"augment": True, "symmetric_play": True}
 _LEARNER: dict[str, Any] = {
     **_SYMMETRY,
-    "learning_rate": 1e-3,
+    "learning_rate": 3e-3,
     "learning_rate_end": 1e-4,
+    "target_step": 0.004,
+    "reward_norm": True,
     "n_step": 3,
     "double_q": False,
     "averaged": True,
@@ -128,9 +130,7 @@ _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
 
 
 def _graph_q(name: str, mixer: Literal["qmix", "vdn"]) -> RunConfig:
-    tuned = {"learning_rate": 3e-3, "reward_norm": True, "target_step": 0.004, "epsilon_steps": 13_000}
-    settings: dict[str, Any] = {**_LEARNER, **tuned}
-    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, **settings)
+    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, epsilon_steps=13_000, **_LEARNER)
     return _dear(name, algorithm, EnvConfig(), _GACRL.training)
 
 

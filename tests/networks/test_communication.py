@@ -99,6 +99,22 @@ def test_symbols_are_one_hot_and_their_entropy_is_that_of_their_distribution():
     assert np.abs(said.mean(0) - chances).max() < 5 * np.sqrt(0.25 / 4_000)
 
 
+def test_every_weight_of_the_symbols_matters():
+    """The receiver's too: what it knows decides whom it attends to."""
+    net, key = talk("discrete", rounds=2), jax.random.key(1)
+    hidden, offsets = jax.random.normal(key, (6, 8)), jax.random.normal(jax.random.key(2), (6, 6, 2))
+    near = Neighbourhood(~jnp.eye(6, dtype=bool), offsets)
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def slope(net: Any) -> Any:
+        spoken = net.speak(hidden, near, Channel(), key, 1.0).hidden
+        return jnp.sum(spoken * jax.random.normal(jax.random.key(3), spoken.shape))
+
+    for path, leaf in jax.tree_util.tree_leaves_with_path(slope(net)):
+        assert jnp.abs(leaf).max() > 1e-4, jax.tree_util.keystr(path)
+
+
 # Who is heard.
 
 

@@ -248,7 +248,7 @@ def _worth(full: Outcome, without: Outcome) -> list[float] | None:
 def _report(out: Path, config: RunConfig, outcomes: Sequence[Outcome]) -> Path:
     page = Page("What each part of GACRL is worth")
     page.text(
-        f"`{config.preset}`, {config.training.env_steps:,} environment steps in episodes of {config.env.max_cycles}, "
+        f"{config.preset}, {config.training.env_steps:,} environment steps in episodes of {config.env.max_cycles}, "
         f"{config.num_seeds} seeds from {config.seed}; closing evaluation: {config.evaluation.final_episodes} fixed "
         "episodes, greedy, last parameters, on MPE2's own reward. Interquartile mean over seeds and its 95 % "
         "stratified-bootstrap interval. Where a part has parameters, the network without it is wider, so that it "

@@ -5,6 +5,7 @@ something now and takes in what the others say now (CommNet, discrete). All mess
 `networks.messages.transmit`, so that a channel silences, delays and scrambles all of them alike.
 """
 
+import math
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -128,26 +129,27 @@ class Symbols(Silence):
 
     The first round's symbol is made of the agent's code, where it has one, as the paper's is of its latent; those
     of later rounds of what it knows by then. A receiver knows where the speaker stands: an edge's embedding is of
-    the symbol and the offset. Over the neighbours: the mean, weighted by the receiver's attention.
+    the symbol and the offset. Over the neighbours: the mean, weighted by attention (scaled dot product of the
+    receiver's query and the edge's embedding).
 
     With `nearest_agents` each agent hears its nearest neighbours alone, and the cost grows with N · nearest_agents.
     """
 
     encode: tuple[Linear, ...]
     edge: tuple[Mlp, ...]
-    attention: tuple[Linear, ...]
+    query: tuple[Linear, ...]
     merge: tuple[Linear, ...]
     straight_through: bool = eqx.field(static=True)
     nearest: int | None = eqx.field(static=True)
 
     def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, narrow, symbols = config.width, config.width // 2, config.vocabulary
-        encode, edge, attention, merge = jax.random.split(key, (4, config.rounds))
+        encode, edge, query, merge = jax.random.split(key, (4, config.rounds))
         first = width if config.latent == "none" else config.latent_size
         sizes = (first, *[width] * (config.rounds - 1))
         self.encode = tuple(Linear(i, symbols, k, gain) for i, k in zip(sizes, encode, strict=True))
         self.edge = tuple(Mlp(symbols + 3, (narrow,), k, gain) for k in edge)
-        self.attention = tuple(Linear(width + narrow, 1, k, gain) for k in attention)
+        self.query = tuple(Linear(width, narrow, k, gain) for k in query)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
         self.straight_through = config.communication == "discrete"
         self.nearest = config.nearest_agents
@@ -163,8 +165,8 @@ class Symbols(Silence):
     ) -> Spoken:
         edges, speakers = _edges(near, self.nearest)
         where, message, entropy = with_length(edges.offsets), None, jnp.zeros(hidden.shape[0])
-        for number, (encode, edge, attention, merge) in enumerate(
-            zip(self.encode, self.edge, self.attention, self.merge, strict=True)
+        for number, (encode, edge, query, merge) in enumerate(
+            zip(self.encode, self.edge, self.query, self.merge, strict=True)
         ):
             logits = encode(hidden if code is None or number else code)
             log_symbol = jax.nn.log_softmax(logits)
@@ -176,8 +178,7 @@ class Symbols(Silence):
                 message = gumbel_softmax(logits, noise, temperature, self.straight_through)
             symbols = _received(message, channel, key, speakers)
             received = edge(jnp.concatenate([symbols, where], axis=-1))  # [N K H/2]
-            receiver = jnp.broadcast_to(hidden[:, None, :], (*received.shape[:2], hidden.shape[-1]))
-            score = attention(jnp.concatenate([receiver, received], axis=-1))[..., 0]
+            score = jnp.einsum("nh,nkh->nk", query(hidden), received) / math.sqrt(received.shape[-1])
             heard = attend(received, jnp.where(edges.adjacency, score, -jnp.inf))
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
         return Spoken(hidden, message, (), entropy)
