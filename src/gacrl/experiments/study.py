@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from gacrl.config import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.training import session
+from gacrl.training.devices import release_memory
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Run, Watcher
@@ -77,7 +76,7 @@ def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
             (planned.folder / DIVERGED).write_text(text, encoding="utf-8")
             watch.finished(planned.name, "diverged")
         finally:
-            jax.clear_caches()  # JAX keeps the programs of every run, some 90 MB, as long as the process lives
+            release_memory()
     return True
 
 
