@@ -89,8 +89,7 @@ def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():
                 offsets = jnp.asarray(positions[near] - positions[i])
                 where = jnp.concatenate([offsets, jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)], -1)
                 edges = talk.edge[number](jnp.concatenate([jnp.stack([told[j] for j in near]), where], -1))
-                receiver = jnp.broadcast_to(hidden[i], (len(near), 8))
-                score = talk.attention[number](jnp.concatenate([receiver, edges], -1))[:, 0]
+                score = edges @ talk.query[number](hidden[i])[0] / 2  # √4 numbers of an edge
                 heard = jax.nn.softmax(score) @ edges
             merged = talk.merge[number](jnp.concatenate([hidden[i], heard[None]], -1))
             after.append(hidden[i] + jax.nn.relu(merged))
