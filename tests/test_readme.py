@@ -40,7 +40,9 @@ def room(tmp_path_factory, quick_start):
     def short(preset: config.RunConfig) -> config.RunConfig:
         algorithm = preset.algorithm
         if isinstance(algorithm, GacrlConfig):
-            algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500, symmetric_play=False)
+            network = replace(algorithm.network, torso="mlp", rounds=1, width=8)
+            algorithm = replace(algorithm, network=network, updates=1, batch_size=8, replay_capacity=500)
+            algorithm = replace(algorithm, n_step=1, augment=False, symmetric_play=False)
         return replace(
             preset,
             algorithm=algorithm,

@@ -11,6 +11,8 @@ from gacrl.envs import copies
 from gacrl.envs.probes import Probe
 from gacrl.envs.spread import Spread, SpreadParams
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 E = 6
 KEY = jax.random.key(0)
 MASKED = SpreadParams(

@@ -13,6 +13,8 @@ from gacrl.envs.potential import assignment_potential
 from gacrl.envs.spread import Spread
 from gacrl.training import session
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 AGENTS = jnp.array([[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]])
 LANDMARKS = jnp.array([[-1.0, 0.0], [0.25, 0.0]])
 

@@ -8,6 +8,8 @@ import pytest
 from gacrl.envs.spread import Spread, SpreadState
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def turned(state: SpreadState, symmetry: int) -> SpreadState:
     return state._replace(

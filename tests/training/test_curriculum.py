@@ -67,7 +67,9 @@ def test_arena_and_team_grow_to_the_configured_task():
 GROWING = RunConfig(
     algorithm=replace(
         configuration.preset("gacrl").algorithm,
-        network=replace(configuration.preset("gacrl").algorithm.network, width=8, latent_size=2),
+        network=replace(configuration.preset("gacrl").algorithm.network, width=8, latent_size=2, rounds=1),
+        augment=False,
+        symmetric_play=False,
         replay_capacity=64,
         learning_starts=8,
         batch_size=4,
