@@ -15,7 +15,7 @@ import gacrl
 PACKAGE = Path(gacrl.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "checks", "algorithm_config", "run_config", "presets", "config"),
+    ("errors", "types", "checks", "versions", "algorithm_config", "run_config", "presets", "config"),
     ("arguments", "envs", "networks", "report"),
     ("algorithms",),
     ("rollout",),

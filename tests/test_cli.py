@@ -9,6 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,10 @@ def test_a_device_without_memory_left_is_told(refused: Callable[..., str], monke
     assert "281474976710656 bytes): take fewer seeds" in said
 
 
+def no_package(name: str) -> str:
+    raise metadata.PackageNotFoundError(name)
+
+
 def no_space(*_: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -336,6 +341,10 @@ def test_presets_and_settings_are_printed(answered: Callable[..., Any], capsys: 
         assert capsys.readouterr().out == configuration.dumps(settings)
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("gacrl 0.")
+    with pytest.MonkeyPatch.context() as uninstalled:
+        uninstalled.setattr(metadata, "version", no_package)
+        assert main(["--version"]) == 0
+        assert capsys.readouterr().out == "gacrl not installed\n"
     assert main([]) == 0
     assert "usage: gacrl COMMAND" in capsys.readouterr().out
 

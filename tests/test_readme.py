@@ -40,9 +40,7 @@ def room(tmp_path_factory, quick_start):
     def short(preset: config.RunConfig) -> config.RunConfig:
         algorithm = preset.algorithm
         if isinstance(algorithm, GacrlConfig):
-            network = replace(algorithm.network, torso="mlp", rounds=1, width=8)
-            algorithm = replace(algorithm, network=network, updates=1, batch_size=8, replay_capacity=500)
-            algorithm = replace(algorithm, n_step=1, augment=False, symmetric_play=False)
+            algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500)
         return replace(
             preset,
             algorithm=algorithm,

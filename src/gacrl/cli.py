@@ -57,9 +57,9 @@ def main(words: Sequence[str] | None = None) -> int:
         print(OVERVIEW, end="")
         return 0
     if words[0] == "--version":
-        from importlib.metadata import version
+        from gacrl.versions import version
 
-        print(f"gacrl {version('gacrl')}")
+        print(f"gacrl {version()}")
         return 0
     try:
         if words[0] not in _COMMANDS:

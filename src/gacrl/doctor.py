@@ -17,7 +17,7 @@ from gacrl.envs.probes import BEST_RETURN
 from gacrl.evaluation import mpe2
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.probing import probe_algorithm
-from gacrl.training.session import versions
+from gacrl.versions import versions
 
 BEYOND = {
     # Its messages are made from the latent alone, which the printed weight of the KL term keeps empty.

@@ -10,7 +10,6 @@ import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.metadata import version
 
 import jax
 
@@ -20,6 +19,7 @@ from gacrl.training.devices import wait_for_all
 from gacrl.training.peers import Peers, Place, meet
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Plan, Watcher
+from gacrl.versions import version
 
 ALONE = Place(0, 1, "", 0)
 
@@ -80,7 +80,7 @@ def joined(place: Place, settings: str, seconds: float, watcher: Watcher) -> Gen
     if place.count == 1:
         yield watcher
         return
-    peers = meet(place, f"{version('gacrl')} {jax.__version__} {settings}", seconds)
+    peers = meet(place, f"{version()} {jax.__version__} {settings}", seconds)
     try:
         jax.config.update("jax_enable_preemption_service", False)  # it would keep SIGTERM from us
         jax.distributed.initialize(

@@ -1,12 +1,9 @@
 """A run from its settings to its summary: what the command line and `gacrl.train` both call."""
 
-import platform
-import subprocess
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +31,7 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
+from gacrl.versions import versions
 
 SHOWN_EPISODES = 4
 """Episodes that a run keeps, and shows in its GIF."""
@@ -296,26 +294,6 @@ def scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[...,
     return jax.jit(
         lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
     )
-
-
-def versions() -> dict[str, str]:
-    """What produced a run: packages, Python, and the commit where the source is a git checkout."""
-    packages = ("gacrl", "jax", "jaxlib", "equinox", "optax", "numpy", "mpe2")
-    found = {name: _version(name) for name in packages}
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return {**found, "python": platform.python_version()}
-    commit = {"git_commit": done.stdout.strip()} if done.returncode == 0 else {}
-    return {**found, "python": platform.python_version(), **commit}
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:  # imported from a folder of sources that was never installed
-        return "not installed"
 
 
 def _member_shapes(trainer: Trainer) -> TrainState:
