@@ -246,6 +246,8 @@ class Ablate:
     """The first of them."""
     env_steps: int | None = None
     """Environment steps of each seed; none: the preset's."""
+    updates: int | None = None
+    """Gradient steps after each rollout; none: half of the preset's, so that all of it takes an hour on two cores."""
     out: Path = Path("runs/ablation")
     """The folder of the runs and the report."""
     json: bool = False

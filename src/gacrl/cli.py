@@ -322,7 +322,7 @@ def _ablate(words: list[str]) -> int:
 
     def study(watch: "Watch") -> "Ablation | None":
         config = replace(configuration.preset(asked.preset), seed=asked.seed)
-        return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, watch)
+        return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
 
     return _studied(study, asked.out, asked.json)
 

@@ -125,7 +125,11 @@ def test_the_command_says_what_each_part_is_worth(
     assert "diverged: seed 0 diverged" in page
     assert "0.701 [0.700, 0.702]" in page
     assert page.count("<figure>") == 4
-    assert "gacrl ablate --preset gacrl-112k --seeds 3 --seed 0 --env-steps 112500 --part no-messages" in page
+    assert (
+        "gacrl ablate --preset gacrl-112k --seeds 3 --seed 0 --env-steps 112500 --updates 5 --part no-messages"
+        in page
+    )
+    assert "5 gradient steps after every 25 (the preset has 10)" in page
 
     before = len(trained)
     assert main(words) == 0

@@ -116,12 +116,15 @@ def ablate(
     seeds: int = 5,
     env_steps: int | None = None,
     parts: Sequence[str] = (),
+    updates: int | None = None,
     watch: Watch | None = None,
 ) -> Ablation | None:
     """Train what is missing under `out`, write `report.html`, `report.md` and `summary.json` there.
 
-    parts: names in PARTS; none: all. Returns None where the watcher's stop ended it early. Raises UserError for fewer
-    than two seeds, a part there is not, settings that are not GACRL's, or a folder that holds something else.
+    parts: names in PARTS; none: all. updates: gradient steps after each rollout; none: half of the configured ones,
+    with which `gacrl-112k` covers as much (docs/results.md) and all parts fit an hour on two cores. Returns None where
+    the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
+    not GACRL's, or a folder that holds something else.
     """
     watch = watch or Watch()
     if seeds < 2:
@@ -132,8 +135,10 @@ def ablate(
         if name not in PARTS:
             raise UserError(configuration.unknown("part", name, list(PARTS)))
     steps = config.training.env_steps if env_steps is None else env_steps
+    updates = max(_updates(config) // 2, 1) if updates is None else updates
     config = replace(
         config,
+        algorithm=replace(config.algorithm, updates=updates),
         num_seeds=seeds,
         training=replace(config.training, env_steps=steps),
         evaluation=replace(config.evaluation, interval=max(steps // EVALUATIONS, 1)),
@@ -249,14 +254,15 @@ def _report(out: Path, config: RunConfig, outcomes: Sequence[Outcome]) -> Path:
     page = Page("What each part of GACRL is worth")
     page.text(
         f"{config.preset}, {config.training.env_steps:,} environment steps in episodes of {config.env.max_cycles}, "
-        f"{config.num_seeds} seeds from {config.seed}; closing evaluation: {config.evaluation.final_episodes} fixed "
-        "episodes, greedy, last parameters, on MPE2's own reward. Interquartile mean over seeds and its 95 % "
-        "stratified-bootstrap interval. Where a part has parameters, the network without it is wider, so that it "
-        "has about as many."
+        f"{_updates(config)} gradient steps after every {config.steps_per_update} (the preset has "
+        f"{_updates(configuration.preset(config.preset))}), {config.num_seeds} seeds from {config.seed}; closing "
+        f"evaluation: {config.evaluation.final_episodes} fixed episodes, greedy, last parameters, MPE2's own reward. "
+        "Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part has parameters, the "
+        "network without it is wider, so that it has about as many."
     )
     rows: list[list[str]] = []
     for outcome in outcomes:
-        says = PARTS[outcome.name].says if outcome.name in PARTS else "the preset as it is"
+        says = PARTS[outcome.name].says if outcome.name in PARTS else "nothing taken away"
         if outcome.diverged is not None:
             cells = [f"diverged: {outcome.diverged}", *[""] * len(METRICS)]
         else:
@@ -314,6 +320,11 @@ def _report(out: Path, config: RunConfig, outcomes: Sequence[Outcome]) -> Path:
     return page.write(out, "report")
 
 
+def _updates(config: RunConfig) -> int:
+    assert isinstance(config.algorithm, GacrlConfig)
+    return config.algorithm.updates
+
+
 def _interval(found: Sequence[float], digits: int = 3) -> str:
     point, low, high = (f"{number:.{digits}f}" for number in found)
     return f"{point} [{low}, {high}]"
@@ -331,7 +342,7 @@ def _against_coverage(outcome: Outcome) -> figures.Series:
 
 def _command(config: RunConfig, outcomes: Sequence[Outcome]) -> str:
     words = ["gacrl ablate", f"--preset {config.preset}", f"--seeds {config.num_seeds}", f"--seed {config.seed}"]
-    words.append(f"--env-steps {config.training.env_steps}")
+    words += [f"--env-steps {config.training.env_steps}", f"--updates {_updates(config)}"]
     if len(outcomes) <= len(PARTS):
         words += [f"--part {outcome.name}" for outcome in outcomes[1:]]
     return " ".join(words)

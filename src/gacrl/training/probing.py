@@ -13,6 +13,7 @@ from gacrl.config import TrainingConfig
 from gacrl.envs.probes import PROBES, Probe, ProbeParams
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.curriculum import constant
+from gacrl.training.devices import KNOWN_XLA
 from gacrl.training.trainer import Trainer
 from gacrl.types import Channel, Learner
 
@@ -61,9 +62,9 @@ def probe_algorithm(
 def _compiled(program: Callable[[jax.Array], dict[str, jax.Array]]) -> Any:
     """Optimised no more than a program deserves that runs for seconds: compiling it then takes a third of the time.
 
-    With the options that JAX 0.10 is known to have; other versions compile as they like.
+    On versions that are known to have these options; others compile as they like.
     """
-    known = jax.default_backend() == "cpu" and jax.__version__.startswith("0.10.")
+    known = KNOWN_XLA and jax.default_backend() == "cpu"
     options = {
         "xla_backend_optimization_level": 0,
         "xla_llvm_disable_expensive_passes": True,

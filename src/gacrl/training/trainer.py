@@ -73,7 +73,9 @@ class Trainer:
         num_seeds: int = 1,
         evaluation_env: Environment | None = None,
         mesh: Mesh | None = None,
+        for_speed: bool = True,
     ):
+        """for_speed: what `devices.compiler_options` makes of it."""
         self.algorithm = algorithm
         self.env = env
         self.curriculum = curriculum
@@ -88,7 +90,7 @@ class Trainer:
         self.metric_names = metric_names(self.measures)
         """What the vectors of a chunk's episode summary hold."""
         self.chunk = jax.jit(
-            map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=compiler_options()
+            map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=compiler_options(for_speed)
         )
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:

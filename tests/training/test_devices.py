@@ -1,0 +1,35 @@
+"""How JAX is set up: quickly compiled but for training, and only where the user has not chosen."""
+
+import jax
+import pytest
+
+from gacrl.training import devices
+
+CPU_ONLY = pytest.mark.skipif(not devices.KNOWN_XLA, reason="another version compiles as it likes")
+
+
+@pytest.fixture
+def unset(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """No flags yet; JAX's settings of the tests stay."""
+    monkeypatch.delenv("XLA_FLAGS")
+    monkeypatch.setenv("NPROC", "1")
+    monkeypatch.setattr(jax.config, "update", lambda *setting: None)
+    return monkeypatch
+
+
+@CPU_ONLY
+def test_training_is_compiled_for_speed_and_all_else_quickly(unset: pytest.MonkeyPatch):
+    devices.prepare_jax()
+    fast, quick = devices.compiler_options(), devices.compiler_options(for_speed=False)
+    assert fast["xla_cpu_use_fusion_emitters"] is True and fast["xla_backend_optimization_level"] == 3
+    assert set(fast) - set(quick) == {"xla_cpu_use_fusion_emitters", "xla_backend_optimization_level"}
+    for options in (fast, quick):
+        assert jax.jit(lambda x: x + 1, compiler_options=options)(1) == 2, "XLA knows them"
+
+
+@CPU_ONLY
+def test_whoever_sets_the_flags_has_the_choice(unset: pytest.MonkeyPatch):
+    unset.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    devices.prepare_jax()
+    assert devices.os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
+    assert devices.compiler_options() == devices.compiler_options(for_speed=False)
