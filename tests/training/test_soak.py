@@ -4,14 +4,10 @@
 """
 
 import contextlib
-import gc
 import io
-import itertools
 import json
 import os
 import random
-import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -26,8 +22,6 @@ import pytest
 from gacrl import config as configuration
 from gacrl.cli import main
 from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
-from gacrl.experiments.study import Planned, Watch, train_missing
-from gacrl.training.session import Watcher
 
 pytestmark = [pytest.mark.soak, pytest.mark.usefixtures("quick_start")]
 
@@ -172,21 +166,11 @@ def test_killed_again_and_again(start: Any, tmp_path: Path):
     assert max(seen.files) <= min(seen.files) + 8, "files stay open"
 
 
-def test_one_process_that_never_ends(tmp_path: Path):
+def test_one_process_that_never_ends(tmp_path: Path, quick_start: dict[str, str]):
     """Runs begun, stopped and gone on with in one process, as a study does: neither memory nor open files grow."""
-    resident: list[int] = []
-    files: list[int] = []
-    end = time.monotonic() + SECONDS
-    while time.monotonic() < end or len(resident) < 6:
-        folder, asked = tmp_path / "run", itertools.count(1)
-        planned = [Planned("run", config(env_steps=160), folder)]
-        third_time = Watcher(stop=lambda asked=asked: next(asked) == 3)
-        assert not train_missing(planned, Watch(run=lambda name, watcher=third_time: watcher))
-        assert train_missing(planned, Watch())
-        shutil.rmtree(folder)
-        gc.collect()
-        resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 2**20)
-        files.append(len(list(Path("/proc/self/fd").iterdir())))
+    worker = [sys.executable, Path(__file__).parent / "study_worker.py", tmp_path / "run", SECONDS]
+    done = subprocess.run(list(map(str, worker)), env=quick_start, capture_output=True, text=True, check=True)
+    resident, files = zip(*(map(int, line.split()) for line in done.stdout.splitlines()), strict=True)
     print(resident, files)
     settled = resident[2:]
     half = len(settled) // 2
