@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxprs_in_params
 
 
 class Product(NamedTuple):
@@ -37,7 +38,7 @@ def products(jaxpr: Any) -> Counter[Product]:
             found += max((products(branch.jaxpr) for branch in settings["branches"]), key=total)
         else:
             times = settings["length"] if name == "scan" else 1
-            for inner in jax.core.jaxprs_in_params(settings):
+            for inner in jaxprs_in_params(settings):
                 found += Counter({product: times * count for product, count in products(inner).items()})
     return found
 

@@ -66,11 +66,11 @@ def settings(num_agents: int = 3, num_envs: int = 25, batch_size: int = 64, **ne
 
 def moved(jaxpr: Any) -> np.ndarray:
     """Bytes that one run of a jaxpr reads and writes, and rows that it writes, products and reshapings aside."""
-    import jax
+    from jax.extend.core import jaxprs_in_params
 
     count = np.zeros(2)
     for equation in jaxpr.eqns:
-        name, inner = equation.primitive.name, list(jax.core.jaxprs_in_params(equation.params))
+        name, inner = equation.primitive.name, list(jaxprs_in_params(equation.params))
         if name == "cond":
             count += max((moved(branch.jaxpr) for branch in equation.params["branches"]), key=lambda both: both[0])
         elif inner:
