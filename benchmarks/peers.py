@@ -121,7 +121,7 @@ class Side:
             command = command[3:]
         self.process = subprocess.Popen(
             command,
-            env={**os.environ, **ONE_THREAD},
+            env={**os.environ, **ONE_THREAD, "XLA_FLAGS": ""},  # as XLA compiles by itself
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE if name != "ours" else None,

@@ -90,7 +90,7 @@ def build(config: RunConfig) -> Trainer:
         num_seeds=config.num_seeds,
         evaluation_env=evaluation_env(config),
         mesh=mesh(config),
-        # GACRL's program is as quick when it is quickly compiled, others' by 3 to 10 % less (docs/results.md).
+        # GACRL's program is as quick when it is quickly compiled, others' 3 to 10 % slower (docs/design.md).
         for_speed=not isinstance(config.algorithm, GacrlConfig),
     )
 
