@@ -150,8 +150,10 @@ def main() -> None:
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
+    print(f"compiling {len(POINTS)} programs", flush=True)
     points = [Point(point) for point in POINTS]
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
+        print(f"measuring, round {turn + 1} of {ROUNDS}", flush=True)
         for point in points:
             point.cost = point.cost._replace(seconds=min(point.cost.seconds, point.measure()))
     costs = [point.cost for point in points]

@@ -247,7 +247,7 @@ class Ablate:
     env_steps: int | None = None
     """Environment steps of each seed; none: the preset's."""
     updates: int | None = None
-    """Gradient steps after each rollout; none: half of the preset's, so that all of it takes an hour on two cores."""
+    """Gradient steps after each rollout; none: half of the preset's; all of it takes about an hour on two cores."""
     out: Path = Path("runs/ablation")
     """The folder of the runs and the report."""
     json: bool = False

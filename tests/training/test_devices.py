@@ -1,11 +1,13 @@
 """How JAX is set up: quickly compiled but for training, and only where the user has not chosen."""
 
+import os
+
 import jax
 import pytest
 
 from gacrl.training import devices
 
-CPU_ONLY = pytest.mark.skipif(not devices.KNOWN_XLA, reason="another version compiles as it likes")
+KNOWN = pytest.mark.skipif(not devices.KNOWN_XLA, reason="another version compiles as it likes")
 
 
 @pytest.fixture
@@ -17,7 +19,7 @@ def unset(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-@CPU_ONLY
+@KNOWN
 def test_training_is_compiled_for_speed_and_all_else_quickly(unset: pytest.MonkeyPatch):
     devices.prepare_jax()
     fast, quick = devices.compiler_options(), devices.compiler_options(for_speed=False)
@@ -27,9 +29,9 @@ def test_training_is_compiled_for_speed_and_all_else_quickly(unset: pytest.Monke
         assert jax.jit(lambda x: x + 1, compiler_options=options)(1) == 2, "XLA knows them"
 
 
-@CPU_ONLY
+@KNOWN
 def test_whoever_sets_the_flags_has_the_choice(unset: pytest.MonkeyPatch):
     unset.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     devices.prepare_jax()
-    assert devices.os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
     assert devices.compiler_options() == devices.compiler_options(for_speed=False)

@@ -169,7 +169,7 @@ def test_killed_again_and_again(start: Any, tmp_path: Path):
 def test_one_process_that_never_ends(tmp_path: Path, quick_start: dict[str, str]):
     """Runs begun, stopped and gone on with in one process, as a study does: neither memory nor open files grow."""
     worker = [sys.executable, Path(__file__).parent / "study_worker.py", tmp_path / "run", SECONDS]
-    done = subprocess.run(list(map(str, worker)), env=quick_start, capture_output=True, text=True, check=True)
+    done = subprocess.run(list(map(str, worker)), env=quick_start, stdout=subprocess.PIPE, text=True, check=True)
     resident, files = zip(*(map(int, line.split()) for line in done.stdout.splitlines()), strict=True)
     print(resident, files)
     settled = resident[2:]

@@ -122,7 +122,7 @@ def ablate(
     """Train what is missing under `out`, write `report.html`, `report.md` and `summary.json` there.
 
     parts: names in PARTS; none: all. updates: gradient steps after each rollout; none: half of the configured ones,
-    with which `gacrl-112k` covers as much (docs/results.md) and all parts fit an hour on two cores. Returns None where
+    with which `gacrl-112k` covers as much (docs/results.md) in little more than half the time. Returns None where
     the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
     not GACRL's, or a folder that holds something else.
     """
@@ -135,7 +135,8 @@ def ablate(
         if name not in PARTS:
             raise UserError(configuration.unknown("part", name, list(PARTS)))
     steps = config.training.env_steps if env_steps is None else env_steps
-    updates = max(_updates(config) // 2, 1) if updates is None else updates
+    configured = config.algorithm.updates
+    updates = max(configured // 2, 1) if updates is None else updates
     config = replace(
         config,
         algorithm=replace(config.algorithm, updates=updates),
@@ -159,7 +160,7 @@ def ablate(
         return None
     watch.say("writing the report")
     outcomes = tuple(_outcome(run) for run in runs)
-    done = Ablation(out, _report(out, config, outcomes), outcomes)
+    done = Ablation(out, _report(out, config, configured, outcomes), outcomes)
     (out / "summary.json").write_text(json.dumps(_data(outcomes), indent=2) + "\n", encoding="utf-8")
     return done
 
@@ -250,12 +251,13 @@ def _worth(full: Outcome, without: Outcome) -> list[float] | None:
     return list(probability_of_improvement(full.final[SCORE], without.final[SCORE]))
 
 
-def _report(out: Path, config: RunConfig, outcomes: Sequence[Outcome]) -> Path:
+def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome]) -> Path:
+    """configured: gradient steps after each rollout, as they were before the ablation chose its own."""
     page = Page("What each part of GACRL is worth")
     page.text(
         f"{config.preset}, {config.training.env_steps:,} environment steps in episodes of {config.env.max_cycles}, "
         f"{_updates(config)} gradient steps after every {config.steps_per_update} (the preset has "
-        f"{_updates(configuration.preset(config.preset))}), {config.num_seeds} seeds from {config.seed}; closing "
+        f"{configured}), {config.num_seeds} seeds from {config.seed}; closing "
         f"evaluation: {config.evaluation.final_episodes} fixed episodes, greedy, last parameters, MPE2's own reward. "
         "Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part has parameters, the "
         "network without it is wider, so that it has about as many."
