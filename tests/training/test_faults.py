@@ -306,6 +306,46 @@ def test_a_damaged_checkpoint_costs_a_chunk_and_no_bit(
     assert said("resume", copy) == (0, "")
 
 
+def test_a_damaged_best_policy_is_out_of_the_way_and_not_thrown_away(
+    copy: Path, said: Callable[..., tuple[int, str]]
+):
+    (best,) = (copy / "checkpoints").glob("best-*")
+    tensors = (best / "state.safetensors").read_bytes()
+    (best / "manifest.json").unlink()
+    shutil.rmtree(copy / "checkpoints/step-000000000450")
+    code, sentence = said("resume", copy)
+    aside = best.with_name(f".damaged-{best.name}")
+    assert (code, sentence) == (
+        0,
+        f"gacrl: the best policy so far was damaged and is {aside} now: the best from here on is kept\n",
+    )
+    assert (aside / "state.safetensors").read_bytes() == tensors
+    assert [path.name for path in (copy / "checkpoints").glob("best-*")] == ["best-000000000450"]
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("episodes", "is no folder, and stands where one belongs: move it away"),
+        ("checkpoints", "is no folder, and stands where one belongs: move it away"),
+        ("summary.json", "is a folder, and stands where a file belongs: move it away"),
+    ],
+)
+def test_what_is_in_the_way_is_told_before_anything_is_trained(
+    copy: Path, said: Callable[..., tuple[int, str]], name: str, sentence: str
+):
+    shutil.rmtree(copy / "checkpoints/step-000000000450")
+    if (copy / name).is_dir():
+        shutil.rmtree(copy / name)
+        (copy / name).touch()
+    else:
+        (copy / name).unlink()
+        (copy / name).mkdir()
+    before = content(copy)
+    assert said("resume", copy) == (2, f"gacrl: {copy / name} {sentence}\n")
+    assert content(copy) == before
+
+
 def test_evaluations_that_are_gone_are_told(copy: Path, said: Callable[..., tuple[int, str]]):
     lines = (copy / "metrics.jsonl").read_text().splitlines(keepends=True)
     (copy / "metrics.jsonl").write_text("".join(lines[4:]))

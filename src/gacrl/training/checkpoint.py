@@ -112,13 +112,21 @@ def newest(folder: Path, kind: str = STEP) -> tuple[Checkpoint, list[str]]:
     raise UserError(f"every checkpoint in {folder} {what}: train the run again into a new folder")
 
 
-def set_aside_after(folder: Path, env_steps: int) -> None:
-    """Rename the damaged checkpoints past a good one, so that they are not counted among those that stay."""
-    for damaged in _folders(folder, STEP):
-        if damaged.name > f"{STEP}{env_steps:012d}":
-            aside = folder / f"{_DAMAGED}{damaged.name}"
-            shutil.rmtree(aside, ignore_errors=True)
-            damaged.rename(aside)
+def set_aside_damaged(folder: Path, kind: str = STEP) -> list[Path]:
+    """Rename the damaged checkpoints past the newest good one, so that they are neither counted nor replaced.
+
+    Returns where they are now.
+    """
+    aside: list[Path] = []
+    for candidate in _folders(folder, kind):
+        try:
+            _inspect(candidate)
+            break
+        except _DAMAGE:
+            target = folder / f"{_DAMAGED}{candidate.name}"
+            shutil.rmtree(target, ignore_errors=True)
+            aside.append(candidate.rename(target))
+    return aside
 
 
 def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, ...] = ()) -> Tree:

@@ -62,6 +62,15 @@ class RunFolder:
             raise UserError(f"{path} is not a run folder: it has no config.json")
         return cls(path)
 
+    def require_room(self) -> None:
+        """Raise UserError where a file stands in the place of a folder, or a folder in that of a file."""
+        for path in (self.checkpoints, self.episodes):
+            if os.path.lexists(path) and not path.is_dir():
+                raise UserError(f"{path} is no folder, and stands where one belongs: move it away")
+        for path in (self.metrics_file, self.summary_file, self.gif):
+            if path.is_dir():
+                raise UserError(f"{path} is a folder, and stands where a file belongs: move it away")
+
     def config(self) -> RunConfig:
         """The settings that the run was started with."""
         try:

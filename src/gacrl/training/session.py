@@ -138,6 +138,7 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     watcher = watcher or Watcher()
     folder = RunFolder.open(path)
     with folder.locked() if leads() else nullcontext():
+        folder.require_room()
         config = folder.config()
         found = newest_checkpoint(folder, watcher.warn)
         if not same_everywhere(-1 if found is None else found.env_steps):
@@ -147,8 +148,12 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
             config = replace(config, training=replace(config.training, env_steps=steps))
         trainer = build(config)
         planned = plan(trainer, config)
-        if found is not None and leads():
-            checkpoint.set_aside_after(folder.checkpoints, found.env_steps)
+        if leads():
+            checkpoint.set_aside_damaged(folder.checkpoints)
+            for aside in checkpoint.set_aside_damaged(folder.checkpoints, checkpoint.BEST):
+                watcher.warn(
+                    f"the best policy so far was damaged and is {aside} now: the best from here on is kept"
+                )
         if extend is not None and leads():
             folder.extend(config.training.env_steps)
         watcher.planned(folder, config, planned)
