@@ -61,10 +61,13 @@ class Case(NamedTuple):
     remembers: bool
     double_q: bool = True
     reward_norm: bool = False
+    time_limits: tuple[int, ...] = (3,)
+    unknown: int | None = None
+    """A time limit too many: what followed it is not computed."""
 
 
-def hand_made(steps: int, remembers: bool) -> Rollout:
-    """One environment: the task ends at step 1, the time limit is at step 3; what followed stands apart."""
+def hand_made(steps: int, case: Case) -> Rollout:
+    """One environment: the task ends at step 1. What followed the last step of an episode stands apart."""
     rng = np.random.default_rng(7)
     _, observation = ENV.reset(jax.random.key(0))
     seen, after = (
@@ -73,17 +76,21 @@ def hand_made(steps: int, remembers: bool) -> Rollout:
         )
         for seed in (1, 2)
     )
-    action = jnp.asarray(rng.integers(A, size=(steps, 1, N)), jnp.int32)
-    memory = AgentMemory(jnp.full((steps, 1, N, 1), 2.0), ()) if remembers else ()
     end = np.arange(steps)[:, None]
+    terminated, truncated = end == 1, np.isin(end, case.time_limits)
+    done = terminated | truncated
+    going_on = ~(done | (end == steps - 1))[..., None, None]
+    after = after._replace(features=jnp.where(going_on, jnp.roll(seen.features, -1, axis=0), after.features))
+    action = jnp.asarray(rng.integers(A, size=(steps, 1, N)), jnp.int32)
+    memory = AgentMemory(jnp.full((steps, 1, N, 1), 2.0), ()) if case.remembers else ()
     return Rollout(
         Transition(
             observation=seen,
             decision=Decision(action, extras={"choice": action, "memory": memory, "mode": ()}),
             reward=jnp.asarray(rng.normal(size=(steps, 1, N)), jnp.float32),
-            terminated=jnp.asarray(end == 1),
-            truncated=jnp.asarray(end == 3),
-            first=jnp.asarray((end == 2) | (end == 4)),
+            terminated=jnp.asarray(terminated),
+            truncated=jnp.asarray(truncated),
+            first=jnp.asarray(np.concatenate([[[False]], done[:-1]])),
             next_observation=after,
             info={},
         ),
@@ -118,6 +125,8 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
             k += 1
             if k == case.n_step or steps.terminated[last] or steps.truncated[last]:
                 break
+        if last == case.unknown:
+            continue
         heard = bonus * (remembered[last] + 1)
         online, slow = scale * after[last] + heard, target_scale * after[last] + heard
         best = (online if case.double_q else slow).argmax(-1)
@@ -134,6 +143,10 @@ CASES = {
     "IQL, one step": Case("iql", 1, 1, False),
     "IQL, three steps, not double": Case("iql", 3, 4, False, double_q=False),
     "VDN, three steps, recurrent, normed": Case("vdn", 3, 4, True, reward_norm=True),
+    "IQL, three steps, recurrent, not double": Case("iql", 3, 4, True, double_q=False),
+    "VDN, recurrent, with time limits sooner than the task says": Case(
+        "vdn", 3, 4, True, time_limits=(0, 2, 3), unknown=3
+    ),
 }
 
 
@@ -172,7 +185,7 @@ def test_the_loss_is_that_of_the_text(name: str):
 
     learner = drawn_learner(algorithm)
     learner = learner._replace(network=at(learner.network, 1.3), target=at(learner.target, -0.7))
-    given = hand_made(steps, case.remembers)
+    given = hand_made(steps, case)
     after, metrics = update(learner, given, jax.random.key(0))
     errors = expected_errors(case, given, 1.3, -0.7)
     assert np.abs(errors).max() < q_learning.HUBER_DELTA

@@ -113,6 +113,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
     adam = clipped_adam(config.max_grad_norm)
     num_envs, num_steps = training.num_envs, training.num_steps
     learned, window = config.sequence_length, config.sequence_length + config.n_step - 1
+    breaks = min(-(-window // env.max_cycles) + 1, window)  # time limits that a window can hold, and its end
     rows = max(-(-config.replay_capacity // (num_envs * num_steps)), -(-window // num_steps)) * num_steps
     hyper = Hyper(
         learning_rate=config.learning_rate,
@@ -192,15 +193,40 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         keys = None if key is None else jax.random.split(key, steps.first.shape[0])
         return unroll(network.agent, steps.observation, steps.first, memory, keys, temperature)
 
+    def best_value(
+        target: Network, theirs: AgentOutput, chooser: AgentOutput, observation: Observation
+    ) -> Float[Array, " M"]:
+        """The target network's value of the actions that are best: by the online network with double Q."""
+        chooser = chooser if config.double_q else theirs
+        best = greedy(chooser.head, actions.mask(observation.action_mask))
+        return parts.team_value(target, theirs, best, observation)
+
     def bootstrap(
         network: Network, target: Network, observation: Observation, memory: Memory, target_memory: Memory
     ) -> Float[Array, " M"]:
-        """The target network's value of the actions that are best: by the online network with double Q."""
-        theirs = target.agent(observation, target_memory)[0]
-        chooser = network.agent(observation, memory)[0] if config.double_q else theirs
-        return parts.team_value(
-            target, theirs, greedy(chooser.head, actions.mask(observation.action_mask)), observation
-        )
+        """The same of an observation that is yet to be looked at."""
+        theirs, chooser = target.agent(observation, target_memory)[0], network.agent(observation, memory)[0]
+        return best_value(target, theirs, chooser, observation)
+
+    def following(
+        network: Network,
+        target: Network,
+        seen: Transition,
+        online: tuple[AgentOutput, Memory],
+        theirs: tuple[AgentOutput, Memory],
+    ) -> tuple[Float[Array, "W M"], Bool[Array, " W"]]:
+        """The same of what followed each step of a window that both have been unrolled along, and where it is known.
+
+        What followed is the next step, but at a time limit, after which the next one is a new episode's, and at the
+        window's end: only there it is looked at anew. A task whose time limit comes sooner than it says has more
+        of these than room is made for, and nothing is learned from the others.
+        """
+        value = jax.vmap(lambda *now: best_value(target, *now))(theirs[0], online[0], seen.observation)
+        broken = seen.truncated.at[-1].set(True)
+        at = jnp.nonzero(broken, size=breaks, fill_value=window - 1)[0]
+        ends = jax.tree.map(lambda leaf: leaf[at], (seen.next_observation, online[1], theirs[1]))
+        anew = jax.vmap(lambda *end: bootstrap(network, target, *end))(*ends)
+        return jnp.roll(value, -1, axis=0).at[at].set(anew), (~broken).at[at].set(True)
 
     def one_window(
         network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
@@ -210,21 +236,21 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
         temperature = parts.exploration.level(learner.exploration, learner.env_steps).temperature
         now = jax.tree.map(lambda leaf: leaf[:learned], seen)
+        weight, last = n_step_window(seen.terminated | seen.truncated, config.n_step)
+        last = last[:learned]
         if forgetful:
             online, _ = outputs(network, now, (), key, temperature)
-            memories = target_memories = ()
-        else:  # all of the window: bootstrapping starts from the memory at its end
-            online, memories = outputs(network, seen, memory, key, temperature)
-            _, target_memories = outputs(target, seen, memory, None, temperature)
-            online = jax.tree.map(lambda leaf: leaf[:learned], online)
+            after = jax.tree.map(lambda leaf: leaf[last], seen.next_observation)
+            future = jax.vmap(lambda after: bootstrap(network, target, after, (), ()))(after)
+            known = jnp.ones(learned, bool)
+        else:
+            unrolled = outputs(network, seen, memory, key, temperature)
+            theirs = outputs(target, seen, memory, None, temperature)
+            future, known = (each[last] for each in following(network, target, seen, unrolled, theirs))
+            online = jax.tree.map(lambda leaf: leaf[:learned], unrolled[0])
         value = jax.vmap(lambda *now: parts.team_value(network, *now))(
             online, now.decision.action, now.observation
         )
-
-        weight, last = n_step_window(seen.terminated | seen.truncated, config.n_step)
-        last = last[:learned]
-        after = jax.tree.map(lambda leaf: leaf[last], (seen.next_observation, memories, target_memories))
-        future = jax.vmap(lambda *after: bootstrap(network, target, *after))(*after)
         shared = config.reward == "team" or value.shape[-1] == 1  # a value of the team is learned from its reward
         reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
         reward = rewards.normalise(reward)[:, : value.shape[-1]]
@@ -234,6 +260,7 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         discount = gamma ** length[:, None] * ~seen.terminated[last][:, None]
         error = value - jax.lax.stop_gradient(earned + discount * future)
         real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
+        real &= known[:, None]
         td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
         auxiliary = parts.auxiliary(online)
         metrics = {"loss_td": td, "value": value.mean(), **auxiliary}
