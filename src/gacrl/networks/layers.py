@@ -43,6 +43,19 @@ class Linear(eqx.Module):
         return y + jnp.broadcast_to(self.bias, y.shape)
 
 
+class Score(eqx.Module):
+    """x ↦ w · x over the last axis of x, for a softmax: a bias would cancel, its gradient be rounding alone."""
+
+    weight: Float[Array, "1 in"]
+
+    def __init__(self, in_size: int, key: PRNGKey, gain: float | None = None):
+        """Weights like those of `Linear`."""
+        self.weight = Linear(in_size, 1, key, gain).weight
+
+    def __call__(self, x: Float[Array, "*b in"]) -> Float[Array, "*b"]:
+        return (x @ self.weight.T)[..., 0]
+
+
 class Mlp(eqx.Module):
     """Affine layers with a ReLU after each of them."""
 

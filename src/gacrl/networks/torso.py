@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from gacrl.algorithm_config import NetworkConfig
 from gacrl.envs.environment import Environment, SpatialEnvironment
 from gacrl.networks.graph import attend, with_length
-from gacrl.networks.layers import Linear, Mlp
+from gacrl.networks.layers import Mlp, Score
 from gacrl.types import Entities, Observation, PRNGKey
 
 NEAR = 0.2
@@ -48,7 +48,7 @@ class GraphTorso(eqx.Module):
     """Of a landmark and another agent: how the latter stands to the former."""
     landmark: Mlp
     agent: Mlp
-    attention: Linear
+    attention: Score
     out: Mlp
     view: Callable[[Observation], Entities] = eqx.field(static=True)
     nearest_landmarks: int | None = eqx.field(static=True)
@@ -61,7 +61,7 @@ class GraphTorso(eqx.Module):
         self.rival = Mlp(2 * SCALES, (narrow,), rival_key, gain)
         self.landmark = Mlp(own + SCALES + narrow, (width, width), landmark_key, gain)
         self.agent = Mlp(own + SCALES, (narrow,), agent_key, gain)
-        self.attention = Linear(width, 1, attention_key, gain)
+        self.attention = Score(width, attention_key, gain)
         self.out = Mlp(own + 2 * width + narrow, (width,), out_key, gain)
         self.view = env.entities if isinstance(env, SpatialEnvironment) else _nothing_in_sight
         self.nearest_landmarks, self.nearest_agents = config.nearest_landmarks, config.nearest_agents
@@ -80,7 +80,7 @@ class GraphTorso(eqx.Module):
 
         # Landmark → agent, and agent → agent.
         places = self.landmark(jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1))
-        score = jnp.where(landmark_there, self.attention(places)[..., 0], -jnp.inf)
+        score = jnp.where(landmark_there, self.attention(places), -jnp.inf)
         chosen = attend(places, score)
         best = _pool_max(places, landmark_there, axis=1)
         others = self.agent(jnp.concatenate([_repeat(own, agents), _scales(agents)], axis=-1))
