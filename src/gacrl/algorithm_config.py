@@ -123,6 +123,9 @@ class NetworkConfig:
 class LearningConfig:
     """What every learner has: its network, its horizon, its step size, and the symmetry of the task."""
 
+    learns_code: ClassVar[bool] = False
+    """Whether there is a loss for the network's code."""
+
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning_rate: float = 1e-3
     """Adam's step size at the start."""
@@ -135,7 +138,7 @@ class LearningConfig:
     max_grad_norm: float = 10.0
     """Longer gradients are shortened to this norm."""
     augment: bool = False
-    """Turn what is learned from by a random one of the task's symmetries."""
+    """Turn what is learned from by a random one of the task's symmetries; a memory then starts empty."""
     symmetric_play: bool = False
     """Play greedily by the mean over the task's symmetries, eight for spread: eight times the messages."""
     reward: Literal["team", "own"] = "team"
@@ -148,6 +151,10 @@ class LearningConfig:
         require(
             not (self.symmetric_play and (self.network.recurrent or self.network.communication == "dial")),
             "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network or DIAL",
+        )
+        require(
+            self.network.latent == "none" or self.learns_code,
+            "algorithm.network.latent needs a learner that trains the code, which gacrl does: leave it none",
         )
 
 
@@ -259,6 +266,7 @@ class GacrlConfig(QLearningConfig):
     """GACRL that solves the task: the paper's four ideas on a learner that uses them (docs/algorithm.md)."""
 
     name: ClassVar[str] = "gacrl"
+    learns_code: ClassVar[bool] = True
 
     critic: Literal["central", "sum"] = "central"
     """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""

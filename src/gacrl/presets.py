@@ -77,7 +77,7 @@ _COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds
 _DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
 
 
-GACRL_PARAMETERS = 12_102
+GACRL_PARAMETERS = 12_101
 """Of the acting network of `gacrl`, for three agents."""
 _SYMMETRY: dict[str, Any] = {"augment": True, "symmetric_play": True}
 _LEARNER: dict[str, Any] = {

@@ -72,7 +72,9 @@ def test_it_is_the_mean_over_eight_conversations():
     np.testing.assert_array_equal(decision.message, ask(0).message)
 
 
-def test_a_network_with_a_memory_is_refused():
+def test_networks_that_do_not_go_with_their_learner_are_refused():
+    with pytest.raises(ConfigError, match="latent needs a learner that trains the code"):
+        replace(configuration.preset("mappo").algorithm, network=NetworkConfig(latent="vae"))
     with pytest.raises(ConfigError, match="symmetric_play needs a network without memory"):
         replace(
             configuration.preset("gacrl").algorithm, symmetric_play=True, network=NetworkConfig(recurrent=True)

@@ -63,7 +63,7 @@ class Case(NamedTuple):
     reward_norm: bool = False
     time_limits: tuple[int, ...] = (3,)
     unknown: int | None = None
-    """A time limit too many: what followed it is not computed."""
+    """A time limit too many: its own value stands in for what followed."""
 
 
 def hand_made(steps: int, case: Case) -> Rollout:
@@ -125,10 +125,10 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
             k += 1
             if k == case.n_step or steps.terminated[last] or steps.truncated[last]:
                 break
-        if last == case.unknown:
-            continue
-        heard = bonus * (remembered[last] + 1)
-        online, slow = scale * after[last] + heard, target_scale * after[last] + heard
+        seen, heard = (
+            (after[last], remembered[last] + 1) if last != case.unknown else (here[last], remembered[last])
+        )
+        online, slow = scale * seen + bonus * heard, target_scale * seen + bonus * heard
         best = (online if case.double_q else slow).argmax(-1)
         future = slow[np.arange(N), best]
         value = (scale * here[t] + bonus * remembered[t])[np.arange(N), steps.decision.action[t]]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rlax
 
-from gacrl.algorithms.returns import generalised_advantages, n_step_returns
+from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
 
 T = 12
 
@@ -18,6 +18,29 @@ def test_advantages_by_hand():
     found = generalised_advantages(reward, value, next_value, terminated, truncated, 0.5, 0.5)
     # δ = 1 + ½·1 − ½ = 1;  2 − 1 = 1 (nothing follows);  3 + ½·4 − 2 = 3 (bootstrapped)
     np.testing.assert_allclose(found, [1 + 0.25 * 1, 1, 3])
+
+
+@pytest.mark.parametrize(
+    ("time_limits", "asked", "expected"),
+    [
+        ([3, 7], [3, 7, 9], [11, 12, 13, 103, 15, 16, 17, 107, 19, 109]),  # episodes of 4 steps, cut at the end
+        ([], [9], [11, 12, 13, 14, 15, 16, 17, 18, 19, 109]),
+        ([0, 1, 2, 3, 4], [0, 1, 2, 3], [100, 101, 102, 103, 14, 16, 17, 18, 19, 19]),  # sooner than it says
+    ],
+)
+def test_next_values_are_computed_where_they_are_not_known(
+    time_limits: list[int], asked: list[int], expected: list[int]
+):
+    rows: list[list[int]] = []
+
+    def anew(at: jnp.ndarray) -> jnp.ndarray:
+        rows.append(np.asarray(at).tolist())
+        return 100.0 + at[:, None]
+
+    truncated = jnp.zeros(10, bool).at[jnp.asarray(time_limits, int)].set(True)
+    found = next_values(10.0 + jnp.arange(10.0)[:, None], truncated, 4, anew)
+    assert sorted(set(rows[0])) == asked and len(rows[0]) == 4, "three time limits and the end fit ten steps"
+    np.testing.assert_array_equal(found[:, 0], expected)
 
 
 def test_n_step_returns_by_hand():

@@ -99,6 +99,14 @@ def test_symbols_are_one_hot_and_their_entropy_is_that_of_their_distribution():
     assert np.abs(said.mean(0) - chances).max() < 5 * np.sqrt(0.25 / 4_000)
 
 
+def test_soft_symbols_are_as_soft_in_play():
+    """Learning without noise: what Gumbel-Softmax gives where the noise is the same for all symbols."""
+    net, hidden = talk("soft"), jax.random.normal(jax.random.key(0), (3, 8))
+    near = Neighbourhood(EVERYONE, jnp.zeros((3, 3, 2)))
+    message = net.speak(hidden, near, Channel(), None, 0.5).message
+    np.testing.assert_allclose(message, jax.nn.softmax(net.encode[0](hidden) / 0.5), rtol=1e-6)
+
+
 def test_every_weight_of_the_symbols_matters():
     """The receiver's too: what it knows decides whom it attends to."""
     net, key = talk("discrete", rounds=2), jax.random.key(1)

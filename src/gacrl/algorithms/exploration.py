@@ -125,7 +125,10 @@ def linear(epsilon: tuple[float, float], steps: int, temperature: tuple[float, f
 
 
 class Follower(NamedTuple):
-    """What adaptive exploration knows: how much greedy episodes covered at their end, a running mean."""
+    """What adaptive exploration knows: how much greedy episodes covered at their end, a running mean.
+
+    Greedy in their actions: what they say is drawn as in all of training.
+    """
 
     coverage: Float[Array, ""]
 

@@ -23,7 +23,7 @@ from gacrl.algorithms.objectives import (
     huber,
     no_returns,
 )
-from gacrl.algorithms.returns import generalised_advantages, n_step_returns
+from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_out, share_reward, taken
 from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
@@ -195,17 +195,19 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         learner: LearnerState, steps: Transition, memory: PpoMemory
     ) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
         """Advantages and returns of every agent, in the units of the reward."""
-        critic = learner.network.critic
+        critic, value = learner.network.critic, steps.decision.extras["value"]
 
-        def after(steps: Transition, memory: Memory) -> Float[Array, "T N"]:
-            if critic.memory is None:
-                return jax.vmap(lambda seen: critic(seen)[0])(steps.next_observation)
-            _, memories = critic.unroll(steps.observation, steps.first, memory)
-            return jax.vmap(lambda seen, memory: critic(seen, memory)[0])(steps.next_observation, memories)
+        def after(steps: Transition, memory: Memory, value: Float[Array, "T N"]) -> Float[Array, "T N"]:
+            memories = () if critic.memory is None else critic.unroll(steps.observation, steps.first, memory)[1]
 
-        next_value = learner.norm.denormalise(jax.vmap(after, (1, 0), 1)(steps, memory.critic))
+            def anew(at: Int[Array, " K"]) -> Float[Array, "K N"]:
+                seen, before = jax.tree.map(lambda leaf: leaf[at], (steps.next_observation, memories))
+                return learner.norm.denormalise(jax.vmap(lambda *end: critic(*end)[0])(seen, before))
+
+            return next_values(value, steps.truncated, env.max_cycles, anew)
+
+        next_value = jax.vmap(after, (1, 0, 1), 1)(steps, memory.critic, value)
         reward = share_reward(steps.reward, steps.observation.agent_mask, config.reward == "team")
-        value = steps.decision.extras["value"]
         ends = (steps.terminated[..., None], steps.truncated[..., None])
         terminated, truncated = (jnp.broadcast_to(end, reward.shape) for end in ends)
         gamma = learner.hyper.gamma
@@ -226,10 +228,10 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
             decision=steps.decision._replace(action=steps.decision.extras["choice"]),
         )
         advantage, returns = targets(learner, steps, memory)
-        if (
-            config.augment
-        ):  # advantages and returns do not turn, nor does the probability that the choice was made with
+        if config.augment:
+            # Advantages, returns and the probability of the choice do not turn; what is remembered cannot.
             steps = turn_experience(env, steps, turn_key)
+            memory = jax.tree.map(jnp.zeros_like, memory)
         real = steps.observation.agent_mask
         norm = follow_returns(learner.norm, returns, real) if config.value_norm else learner.norm
         centre = mean_real(advantage, real)

@@ -21,7 +21,7 @@ from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import play, turn_experience
 from gacrl.algorithms.exploration import Exploration, progress_between
 from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
-from gacrl.algorithms.returns import n_step_window
+from gacrl.algorithms.returns import n_step_window, next_values
 from gacrl.algorithms.shared import clipped_adam, share_reward
 from gacrl.config import TrainingConfig
 from gacrl.envs.environment import Environment
@@ -113,7 +113,6 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
     adam = clipped_adam(config.max_grad_norm)
     num_envs, num_steps = training.num_envs, training.num_steps
     learned, window = config.sequence_length, config.sequence_length + config.n_step - 1
-    breaks = min(-(-window // env.max_cycles) + 1, window)  # time limits that a window can hold, and its end
     rows = max(-(-config.replay_capacity // (num_envs * num_steps)), -(-window // num_steps)) * num_steps
     hyper = Hyper(
         learning_rate=config.learning_rate,
@@ -197,36 +196,38 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         target: Network, theirs: AgentOutput, chooser: AgentOutput, observation: Observation
     ) -> Float[Array, " M"]:
         """The target network's value of the actions that are best: by the online network with double Q."""
-        chooser = chooser if config.double_q else theirs
-        best = greedy(chooser.head, actions.mask(observation.action_mask))
+        best = greedy((chooser if config.double_q else theirs).head, actions.mask(observation.action_mask))
         return parts.team_value(target, theirs, best, observation)
 
     def bootstrap(
-        network: Network, target: Network, observation: Observation, memory: Memory, target_memory: Memory
+        network: Network,
+        target: Network,
+        temperature: Array,
+        observation: Observation,
+        memory: Memory,
+        target_memory: Memory,
     ) -> Float[Array, " M"]:
         """The same of an observation that is yet to be looked at."""
-        theirs, chooser = target.agent(observation, target_memory)[0], network.agent(observation, memory)[0]
+        theirs = target.agent(observation, target_memory, temperature=temperature)[0]
+        chooser = network.agent(observation, memory, temperature=temperature)[0] if config.double_q else theirs
         return best_value(target, theirs, chooser, observation)
 
     def following(
         network: Network,
         target: Network,
+        temperature: Array,
         seen: Transition,
         online: tuple[AgentOutput, Memory],
         theirs: tuple[AgentOutput, Memory],
-    ) -> tuple[Float[Array, "W M"], Bool[Array, " W"]]:
-        """The same of what followed each step of a window that both have been unrolled along, and where it is known.
-
-        What followed is the next step, but at a time limit, after which the next one is a new episode's, and at the
-        window's end: only there it is looked at anew. A task whose time limit comes sooner than it says has more
-        of these than room is made for, and nothing is learned from the others.
-        """
+    ) -> Float[Array, "W M"]:
+        """The same of what followed each step of a window that both have been unrolled along."""
         value = jax.vmap(lambda *now: best_value(target, *now))(theirs[0], online[0], seen.observation)
-        broken = seen.truncated.at[-1].set(True)
-        at = jnp.nonzero(broken, size=breaks, fill_value=window - 1)[0]
-        ends = jax.tree.map(lambda leaf: leaf[at], (seen.next_observation, online[1], theirs[1]))
-        anew = jax.vmap(lambda *end: bootstrap(network, target, *end))(*ends)
-        return jnp.roll(value, -1, axis=0).at[at].set(anew), (~broken).at[at].set(True)
+
+        def anew(at: Int[Array, " K"]) -> Float[Array, "K M"]:
+            ends = jax.tree.map(lambda leaf: leaf[at], (seen.next_observation, online[1], theirs[1]))
+            return jax.vmap(lambda *end: bootstrap(network, target, temperature, *end))(*ends)
+
+        return next_values(value, seen.truncated, env.max_cycles, anew)
 
     def one_window(
         network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
@@ -234,6 +235,8 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         """The loss on one window [W, …] of one environment."""
         seen, target = steps.transition, learner.target
         memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
+        if config.augment:  # what is remembered is not turned
+            memory = jax.tree.map(jnp.zeros_like, memory)
         temperature = parts.exploration.level(learner.exploration, learner.env_steps).temperature
         now = jax.tree.map(lambda leaf: leaf[:learned], seen)
         weight, last = n_step_window(seen.terminated | seen.truncated, config.n_step)
@@ -241,12 +244,11 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         if forgetful:
             online, _ = outputs(network, now, (), key, temperature)
             after = jax.tree.map(lambda leaf: leaf[last], seen.next_observation)
-            future = jax.vmap(lambda after: bootstrap(network, target, after, (), ()))(after)
-            known = jnp.ones(learned, bool)
+            future = jax.vmap(lambda after: bootstrap(network, target, temperature, after, (), ()))(after)
         else:
             unrolled = outputs(network, seen, memory, key, temperature)
             theirs = outputs(target, seen, memory, None, temperature)
-            future, known = (each[last] for each in following(network, target, seen, unrolled, theirs))
+            future = following(network, target, temperature, seen, unrolled, theirs)[last]
             online = jax.tree.map(lambda leaf: leaf[:learned], unrolled[0])
         value = jax.vmap(lambda *now: parts.team_value(network, *now))(
             online, now.decision.action, now.observation
@@ -260,7 +262,6 @@ def make(config: QLearningConfig, env: Environment, training: TrainingConfig, pa
         discount = gamma ** length[:, None] * ~seen.terminated[last][:, None]
         error = value - jax.lax.stop_gradient(earned + discount * future)
         real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
-        real &= known[:, None]
         td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
         auxiliary = parts.auxiliary(online)
         metrics = {"loss_td": td, "value": value.mean(), **auxiliary}

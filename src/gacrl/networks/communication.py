@@ -171,7 +171,9 @@ class Symbols(Silence):
             logits = encode(hidden if code is None or number else code)
             log_symbol = jax.nn.log_softmax(logits)
             entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / len(self.encode)
-            if key is None:
+            if key is None and not self.straight_through:
+                message = jax.nn.softmax(logits / temperature)  # as continuous in play as in learning
+            elif key is None:
                 message = most_likely_symbol(logits)
             else:
                 noise = jax.random.gumbel(jax.random.fold_in(key, number), logits.shape)
