@@ -23,8 +23,8 @@ UPDATES = 10
 
 
 def configs(seeds: int) -> dict[str, RunConfig]:
-    """PPO, whose environments are spread, and the paper's learner, whose seeds are."""
-    ippo, paper = preset("ippo"), preset("paper")
+    """PPO, whose environments are spread, and two learners whose seeds are: the paper's and the default one."""
+    ippo, paper, gacrl = preset("ippo"), preset("paper"), preset("gacrl")
     return {
         "ippo": replace(
             ippo,
@@ -36,6 +36,14 @@ def configs(seeds: int) -> dict[str, RunConfig]:
             paper,
             env=replace(paper.env, max_cycles=15),
             algorithm=replace(paper.algorithm, replay_capacity=500),
+            num_seeds=seeds,
+        ),
+        "gacrl": replace(
+            gacrl,
+            algorithm=replace(
+                gacrl.algorithm, replay_capacity=200, learning_starts=20, batch_size=8, updates=2
+            ),  # it learns in nine of the ten updates
+            training=TrainingConfig(env_steps=200, num_envs=4, num_steps=5),
             num_seeds=seeds,
         ),
     }

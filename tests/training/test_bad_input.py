@@ -107,6 +107,8 @@ THINGS = (
     "metrics.jsonl",
     "summary.json",
     "episodes",
+    "episodes.gif",
+    ".metrics.jsonl.unfinished",
     ".lock",
     "checkpoints",
     "checkpoints/step-000000000450",

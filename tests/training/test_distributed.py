@@ -108,15 +108,16 @@ def test_environments_on_eight_devices_and_on_two_processes(job: Job, tmp_path: 
 def test_seeds_on_eight_devices_and_environments_and_seeds_on_four_processes(job: Job, tmp_path: Path):
     for folder in ("eight", "four"):
         (tmp_path / folder).mkdir()
-    job.start(WORKER, "paper", tmp_path / "eight", 8)
+    job.start(WORKER, "paper,gacrl", tmp_path / "eight", 8)
     job.finish()
     where = f"127.0.0.1:{free_port()}"
     for process in range(4):
-        job.start(WORKER, "ippo,paper", tmp_path / "four", 1, where, 4, process)
+        job.start(WORKER, "ippo,paper,gacrl", tmp_path / "four", 1, where, 4, process)
     job.finish()
-    seeds = alone("paper", 8)
-    assert_same(tmp_path / "eight" / "paper.npz", seeds, seeds=8)
-    assert_same(tmp_path / "four" / "paper.npz", seeds, seeds=4)
+    for name in ("paper", "gacrl"):
+        seeds = alone(name, 8)
+        assert_same(tmp_path / "eight" / f"{name}.npz", seeds, seeds=8)
+        assert_same(tmp_path / "four" / f"{name}.npz", seeds, seeds=4)
     assert_same(tmp_path / "four" / "ippo.npz", alone("ippo", 4), seeds=1)
 
 

@@ -326,9 +326,10 @@ def test_a_damaged_best_policy_is_out_of_the_way_and_not_thrown_away(
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("episodes", "is no folder, and stands where one belongs: move it away"),
-        ("checkpoints", "is no folder, and stands where one belongs: move it away"),
+        ("episodes", "is a file, and stands where a folder belongs: move it away"),
+        ("checkpoints", "is a file, and stands where a folder belongs: move it away"),
         ("summary.json", "is a folder, and stands where a file belongs: move it away"),
+        ("episodes.gif", "is a link, and a run is written in its own folder: move it away"),
     ],
 )
 def test_what_is_in_the_way_is_told_before_anything_is_trained(
@@ -338,12 +339,27 @@ def test_what_is_in_the_way_is_told_before_anything_is_trained(
     if (copy / name).is_dir():
         shutil.rmtree(copy / name)
         (copy / name).touch()
+    elif name.endswith("gif"):
+        (copy / name).rename(copy.parent / "elsewhere.gif")
+        (copy / name).symlink_to(copy.parent / "elsewhere.gif")
     else:
         (copy / name).unlink()
         (copy / name).mkdir()
     before = content(copy)
     assert said("resume", copy) == (2, f"gacrl: {copy / name} {sentence}\n")
     assert content(copy) == before
+
+
+def test_a_link_in_the_place_of_an_unfinished_file_leads_nobody_out(
+    copy: Path, said: Callable[..., tuple[int, str]], tmp_path: Path
+):
+    outside = tmp_path / "outside.txt"
+    outside.write_text("years of work")
+    for name in ("metrics.jsonl", "summary.json", "config.json"):
+        (copy / f".{name}.unfinished").symlink_to(outside)
+    assert said("resume", copy, "--extend", 30) == (0, "")
+    assert outside.read_text() == "years of work"
+    assert not any(path.is_symlink() for path in copy.iterdir())
 
 
 def test_evaluations_that_are_gone_are_told(copy: Path, said: Callable[..., tuple[int, str]]):

@@ -1,6 +1,6 @@
 """Training that is killed, gone on with and killed again, for as long as it is asked to; and one process that never ends.
 
-`make soak` takes 30 minutes for each; GACRL_SOAK_MINUTES says another time.
+`make soak` takes 30 minutes for each; GACRL_SOAK_MINUTES says another time. A few kills are in `make test`.
 """
 
 import contextlib
@@ -8,6 +8,8 @@ import io
 import json
 import os
 import random
+import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,7 +25,7 @@ from gacrl import config as configuration
 from gacrl.cli import main
 from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
 
-pytestmark = [pytest.mark.soak, pytest.mark.usefixtures("quick_start")]
+pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("soak")]
 
 SECONDS = 60 * float(os.environ.get("GACRL_SOAK_MINUTES", "30"))
 KILLS = int(os.environ.get("GACRL_SOAK_KILLS", "50"))
@@ -122,17 +124,17 @@ def look(child: subprocess.Popen[bytes], seen: Seen) -> None:
         seen.files.append(files)
 
 
-def test_killed_again_and_again(start: Any, tmp_path: Path):
+def kill_again_and_again(start: Any, tmp_path: Path, kills: int, seconds: float) -> Seen:
     """At random moments, also while a checkpoint is written: every run ends with the bits of one that never was."""
     settings = tmp_path / "settings.json"
     settings.write_text(configuration.dumps(config(env_steps=640)))
     whole, chance, seen = tmp_path / "whole", random.Random(0), Seen()
     assert gacrl("train", "--config", settings, "--out", whole) == 0
-    expected, end = rows(whole), time.monotonic() + SECONDS
+    expected, end = rows(whole), time.monotonic() + seconds
     final = {name: json.loads((whole / "summary.json").read_text())[name] for name in ("final", "references")}
 
     folder, number = tmp_path / "run-0", 0
-    while time.monotonic() < end or seen.kills < KILLS:
+    while time.monotonic() < end or seen.kills < kills or not seen.finished:
         resumable = (folder / "config.json").exists()
         words = ("resume", folder) if resumable else ("train", "--config", settings, "--out", folder)
         begun_with = len(rows(folder))
@@ -161,11 +163,22 @@ def test_killed_again_and_again(start: Any, tmp_path: Path):
         number += 1
         folder = tmp_path / f"run-{number}"
     print(seen)
+    assert max(seen.files) <= min(seen.files) + 8, "files stay open"
+    return seen
+
+
+def test_killed_a_few_times(start: Any, tmp_path: Path):
+    assert kill_again_and_again(start, tmp_path, kills=3, seconds=0).kills >= 3
+
+
+@pytest.mark.soak
+def test_killed_again_and_again(start: Any, tmp_path: Path):
+    seen = kill_again_and_again(start, tmp_path, KILLS, SECONDS)
     third = len(seen.memory) // 3
     assert max(seen.memory[-third:]) < 1.1 * max(seen.memory[:third]), "memory grows from process to process"
-    assert max(seen.files) <= min(seen.files) + 8, "files stay open"
 
 
+@pytest.mark.soak
 def test_one_process_that_never_ends(tmp_path: Path, quick_start: dict[str, str]):
     """Runs begun, stopped and gone on with in one process, as a study does: neither memory nor open files grow."""
     worker = [sys.executable, Path(__file__).parent / "study_worker.py", tmp_path / "run", SECONDS]

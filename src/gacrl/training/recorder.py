@@ -63,13 +63,14 @@ class RunFolder:
         return cls(path)
 
     def require_room(self) -> None:
-        """Raise UserError where a file stands in the place of a folder, or a folder in that of a file."""
-        for path in (self.checkpoints, self.episodes):
-            if os.path.lexists(path) and not path.is_dir():
-                raise UserError(f"{path} is no folder, and stands where one belongs: move it away")
-        for path in (self.metrics_file, self.summary_file, self.gif):
-            if path.is_dir():
-                raise UserError(f"{path} is a folder, and stands where a file belongs: move it away")
+        """Raise UserError where a file stands in the place of a folder, a folder in that of a file, or a link."""
+        for path in (self.checkpoints, self.episodes, self.metrics_file, self.summary_file, self.gif):
+            is_folder = path in (self.checkpoints, self.episodes)
+            if path.is_symlink():
+                raise UserError(f"{path} is a link, and a run is written in its own folder: move it away")
+            if path.exists() and path.is_dir() != is_folder:
+                found, wanted = ("file", "folder") if is_folder else ("folder", "file")
+                raise UserError(f"{path} is a {found}, and stands where a {wanted} belongs: move it away")
 
     def config(self) -> RunConfig:
         """The settings that the run was started with."""
@@ -141,7 +142,8 @@ class RunFolder:
     def _replace(self, path: Path, text: str) -> None:
         """Write a whole file so that a reader sees the old one or the new one, never half of it."""
         unfinished = path.with_name(f".{path.name}.unfinished")
-        with unfinished.open("w", encoding="utf-8") as file:
+        unfinished.unlink(missing_ok=True)  # by a process that was killed; or a link, which must lead nobody away
+        with unfinished.open("x", encoding="utf-8") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
