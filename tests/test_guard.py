@@ -28,6 +28,8 @@ def test_a_ratio_that_fell_by_more_than_the_tolerance_is_named(guard, capsys):
     said = capsys.readouterr().out
     assert said.count("FALLEN") == 1
     assert "8.4 (8 to 20)" in said
+    missing = ["environment: peer at 1 (not measured)", "environment: peer at 32 (not measured)"]
+    assert guard.fallen("environment", {}, before) == missing, "a peer that is not there is not let through"
 
 
 def test_a_program_that_grew_by_more_than_the_tolerance_is_named(guard):

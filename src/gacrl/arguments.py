@@ -158,12 +158,15 @@ class Compare:
     examples:
       gacrl compare runs/mappo-1 runs/qmix-1
       gacrl compare runs/gacrl-1 runs/gacrl-2 runs/vdn-1 --metric coverage_final_0.1 --out runs/comparison
+      gacrl compare runs/gacrl-1 runs/vdn-1 --metric coverage_final_0.1 --margin 0.02
     """
 
     run: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders."""
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A metric of the closing evaluation; may be given several times. None: return and coverage within 0.1."""
+    margin: float | None = None
+    """Also test whether groups differ by less than this, in the units of the one metric (two one-sided tests)."""
     sampled: bool = False
     """Compare the policies as they explore, instead of greedily."""
     out: Path | None = None

@@ -266,7 +266,7 @@ def _compare(words: list[str]) -> int:
         if path is not None and path.exists() and not asked.overwrite:
             raise UserError(f"{path} exists: choose another place, or say --overwrite")
     play = "sampled" if asked.sampled else "greedy"
-    comparison = compare.compare(asked.run, asked.metric or compare.METRICS, play, _warn)
+    comparison = compare.compare(asked.run, asked.metric or compare.METRICS, play, _warn, asked.margin)
     compare_report.print_comparison(comparison)
     if asked.out is not None:
         print(f"page       {compare_report.write_page(comparison, asked.out)}")

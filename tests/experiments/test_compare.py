@@ -124,6 +124,25 @@ def test_where_lower_is_better_the_lower_one_improves(make_run: MakeRun):
     assert found.pairs[0].claimed == "vdn"
 
 
+def test_a_margin_tests_for_equivalence(
+    make_run: MakeRun, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+):
+    runs = make_run("a", VDN, HIGH), make_run("b", MAPPO, [value + 0.1 for value in HIGH])
+    assert refused(*runs, "--margin", 2) == "a margin is in the units of a metric: name one with --metric"
+    for margin, told in (
+        (2.0, "; equivalent within 2 (p = "),
+        (0.2, "; not shown to be equivalent within 0.2 (p = "),
+    ):
+        words = ("--metric", "return_agent_mean", "--margin", str(margin), "--json")
+        assert main(["compare", *map(str, runs), *words]) == 0
+        said = capsys.readouterr().out
+        expected = statistics.equivalent(HIGH, np.array(HIGH) + 0.1, margin)
+        assert json.loads(said.splitlines()[-1])["pairs"][0]["equivalence"]["p_value"] == pytest.approx(
+            expected.p_value
+        )
+        assert told.strip("; ").split(" (")[0] in " ".join(said.split())
+
+
 def test_few_seeds_give_no_verdict(make_run: MakeRun):
     found = compare([make_run("a", VDN, HIGH[:2]), make_run("b", MAPPO, LOW[:3])], ["return_agent_mean"])
     assert found.pairs[0].difference is not None
@@ -318,6 +337,12 @@ def test_a_run_that_has_not_ended_is_refused(make_run: MakeRun, refused: Callabl
     run = make_run("a", VDN, HIGH)
     (run / "summary.json").unlink()
     assert refused(run) == f"{run} has not ended, and has no summary.json: `gacrl resume {run}` ends it"
+    steps = VDN.num_updates * VDN.steps_per_update
+    extended = make_run("b", VDN, HIGH, env_steps=steps - 10)  # its end was moved, and not reached
+    assert refused(extended) == (
+        f"{extended} has trained {steps - 10} of {steps} environment steps, and was measured then: "
+        f"`gacrl resume {extended}` ends it"
+    )
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,15 @@ def test_a_printed_mean_is_sought_in_random_and_in_ours(printed: float, verdict:
     assert ask("value", evidence, cells=[["QMIX", "shaped", printed]]) == verdict
 
 
+def test_an_interval_that_has_all_of_randoms_decides_nothing():
+    """One seed that ran away makes the next one's interval so wide that any printed number is in it."""
+    evidence = made_up()
+    ran_away = evidence.trained("paper", "QMIX")
+    for metrics in (ran_away.mean, ran_away.final["greedy"]):
+        metrics["reward_shaped"][0] -= 200.0
+    assert ask("value", evidence, cells=[["QMIX", "shaped", 30.0]]) == "cannot be decided with these seeds"
+
+
 def test_a_row_of_table_2_is_one_episode_or_the_mean_of_fifty():
     """13.42 and 0.73 are ordinary single episodes of random, and no means of 50; −0.08 is neither."""
     evidence = made_up()

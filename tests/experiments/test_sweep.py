@@ -74,15 +74,32 @@ def test_it_goes_on_with_what_is_missing_and_its_numbers_are_those_of_single_run
     assert "group 1 of 1: 1 trainings of 4 episodes" in said
     assert again.means == pytest.approx(done.means)
     assert again.to_dict()["winner"] == done.to_dict()["winner"]
+    with results.open("ab") as file:  # what is no result: other bytes, no number; and one that diverged
+        file.write(
+            b'\xff\xfe\n{"learning_rate": 0.1, "epsilon": 0.3, "temperature": 2.5, "seed": 1, "reward_shaped": NaN}\n'
+        )
+        file.write(
+            b'{"learning_rate": 0.1, "epsilon": 0.3, "temperature": 2.0, "seed": 1, "reward_shaped": null}\n'
+        )
     said.clear()
-    sweep.sweep(grid, tmp_path / "out", said.append, together=2)
+    third = sweep.sweep(grid, tmp_path / "out", said.append, together=2)
+    assert third.winner != Point(0.1, 0.3, 2.0)
+    assert json.loads((tmp_path / "out/summary.json").read_text())["means"][2]["mean"] is None
     assert not any(line.startswith("group") for line in said)
 
     page = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
-    assert "4 settings of GACRL as printed, 2 seeds each" in page
+    assert "4 settings of GACRL as printed, 2 seeds each" in page and "diverged" in page
     assert "| 0.1 | 0.3 | 2.5 |" in page
     assert "would spread over" in page
     assert (tmp_path / "out" / "report-figures" / "surface.svg").is_file()
+
+
+def test_whoever_diverges_does_not_win(grid: Grid, tmp_path: Path):
+    """A policy that is no number stands still, which the shaped reward pays better than what these have learned."""
+    wild = replace(grid, learning_rates=(5e-4, 1e30))
+    done = sweep.sweep(wild, tmp_path / "out", together=4)
+    assert done.winner.learning_rate == 5e-4
+    assert [done.means[point] for point in wild.points if point.learning_rate > 1] == [-np.inf, -np.inf]
 
 
 def test_the_range_of_normal_numbers():

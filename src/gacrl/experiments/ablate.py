@@ -19,7 +19,7 @@ from gacrl.algorithm_config import GacrlConfig
 from gacrl.algorithms.actions import choices
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
-from gacrl.evaluation.statistics import Curve, estimate, probability_of_improvement, sample_efficiency
+from gacrl.evaluation.statistics import Curve, detectable, estimate, probability_of_improvement, sample_efficiency
 from gacrl.experiments.study import (
     Planned,
     Watch,
@@ -40,6 +40,8 @@ SCORE = "coverage_final_0.1"
 """What a part's worth is judged by."""
 EVALUATIONS = 45
 """Along a training; also the number of levels that a yoked one replays."""
+EPISODES = 8
+"""Of each, for the curves: the closing one is what counts, and has the preset's."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def ablate(
         algorithm=replace(config.algorithm, updates=updates),
         num_seeds=seeds,
         training=replace(config.training, env_steps=steps),
-        evaluation=replace(config.evaluation, interval=max(steps // EVALUATIONS, 1)),
+        evaluation=replace(config.evaluation, interval=max(steps // EVALUATIONS, 1), num_episodes=EPISODES),
     )
     runs = plan(config, out, list(dict.fromkeys(parts)) or list(PARTS))
     asked = {"config": configuration.to_dict(config)}
@@ -259,23 +261,25 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
         f"{_updates(config)} gradient steps after every {config.steps_per_update} (the preset has "
         f"{configured}), {config.num_seeds} seeds from {config.seed}; closing "
         f"evaluation: {config.evaluation.final_episodes} fixed episodes, greedy, last parameters, MPE2's own reward. "
-        "Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part has parameters, the "
-        "network without it is wider, so that it has about as many."
+        "Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part of the "
+        "acting network is off, the rest is wider, so that it has about as many parameters; the central critic, which "
+        "does not act, is left out of that count."
     )
     rows: list[list[str]] = []
     for outcome in outcomes:
         says = PARTS[outcome.name].says if outcome.name in PARTS else "nothing taken away"
         if outcome.diverged is not None:
-            cells = [f"diverged: {outcome.diverged}", *[""] * len(METRICS)]
+            cells = [f"diverged: {outcome.diverged}", *[""] * (len(METRICS) + 1)]
         else:
             worth = _worth(outcomes[0], outcome)
             cells = [_interval(estimate(values)) for values in outcome.final.values()]
-            cells.append("" if worth is None else _interval(worth, 2))
+            cells += ["", ""] if worth is None else [_interval(worth, 2), _detectable(outcomes[0], outcome)]
         rows.append([outcome.name, says, f"{outcome.parameters:,}", *cells])
-    page.table(("", "what it is", "parameters", *METRICS, "P(the part helps)"), rows)
+    page.table(("", "what it is", "parameters", *METRICS, "P(the part helps)", "detectable"), rows)
     page.text(
         f"P(the part helps): the probability that a seed with all parts ends with a higher {SCORE} than one without "
-        "it. It is claimed where it is .95 or more and its interval lies above .5; fewer than 10 seeds indicate."
+        "it. It is claimed where it is .95 or more and its interval lies above .5; fewer than 10 seeds indicate. "
+        f"Detectable: the smallest difference of mean {SCORE} that so many seeds would show in 80 % of all repetitions."
     )
     ended = [outcome for outcome in outcomes if outcome.diverged is None]
     page.figure(
@@ -320,6 +324,10 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
     page.heading("How this was made")
     page.code(_command(config, outcomes))
     return page.write(out, "report")
+
+
+def _detectable(full: Outcome, without: Outcome) -> str:
+    return f"{detectable(full.final[SCORE], without.final[SCORE]):.3f}"
 
 
 def _updates(config: RunConfig) -> int:

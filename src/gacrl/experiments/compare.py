@@ -20,7 +20,7 @@ from gacrl import config as configuration
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation import statistics
-from gacrl.evaluation.statistics import Curve, Difference, Estimate
+from gacrl.evaluation.statistics import Curve, Difference, Equivalence, Estimate
 from gacrl.experiments.finished import (
     Finished,
     Play,
@@ -44,13 +44,24 @@ TOO_FEW = 5
 
 _SWITCHES = (
     *("env.reward", "env.max_cycles", "env.local_ratio", "env.num_agent_neighbors", "env.num_landmark_neighbors"),
+    *("env.coverage_bonus", "env.continuous_actions"),
     *("algorithm.network.torso", "algorithm.network.recurrent", "algorithm.network.communication"),
-    *("algorithm.augment", "algorithm.n_step", "algorithm.reward", "algorithm.gamma", "training.env_steps"),
+    *(
+        "algorithm.augment",
+        "algorithm.symmetric_play",
+        "algorithm.n_step",
+        "algorithm.double_q",
+        "algorithm.averaged",
+    ),
+    *("algorithm.reward", "algorithm.gamma", "training.env_steps"),
 )
 _WITHOUT: Mapping[str, Any] = {
     "algorithm.network.torso": "mlp",
     "algorithm.network.recurrent": False,
     "algorithm.augment": False,
+    "algorithm.symmetric_play": False,
+    "algorithm.double_q": False,
+    "algorithm.averaged": False,
     "algorithm.n_step": 1,
 }
 """What an algorithm that lacks a switch does."""
@@ -98,6 +109,8 @@ class Pair(NamedTuple):
 
     seeds: int
     """Of the group that has fewer."""
+    equivalence: Equivalence | None = None
+    """Whether they differ by less than the margin that was asked for."""
 
     @property
     def verdict(self) -> str | None:
@@ -148,14 +161,18 @@ def compare(
     metrics: Sequence[str] = METRICS,
     play: Play = "greedy",
     warn: Warn = lambda sentence: None,
+    margin: float | None = None,
 ) -> Comparison:
     """Read run folders and compare them.
 
-    metrics: names as in `summary.json`. Raises UserError for a run that is damaged or has not ended, for runs
+    metrics: names as in `summary.json`. margin: in the units of the metric, of which there must then be one; groups are
+    tested for differing by less. Raises UserError for a run that is damaged or has not ended, for runs
     of different tasks, and for a metric that there is not or that is not a number somewhere.
     """
     if not runs:
         raise UserError("name at least one run folder: `gacrl compare RUN RUN`")
+    if margin is not None and len(metrics) != 1:
+        raise UserError("a margin is in the units of a metric: name one with --metric")
     loaded = [load(path, warn) for path in runs]
     require_same_task(loaded)
     for metric in metrics:
@@ -171,7 +188,7 @@ def compare(
         play=play,
         metrics=tuple(metrics),
         groups=groups,
-        pairs=tuple(_pair(a, b, metric) for metric in metrics for a, b in combinations(groups, 2)),
+        pairs=tuple(_pair(a, b, metric, margin) for metric in metrics for a, b in combinations(groups, 2)),
         references=first["references"],
         episodes=first["episodes"],
         horizon=first["horizon"],
@@ -251,7 +268,7 @@ def _group(name: str, members: Sequence[Finished], metrics: Sequence[str], play:
     )
 
 
-def _pair(a: Group, b: Group, metric: str) -> Pair:
+def _pair(a: Group, b: Group, metric: str, margin: float | None) -> Pair:
     first, second = a.final[metric], b.final[metric]
     point = a.point(metric) - b.point(metric)
     if min(len(first), len(second)) < 2:
@@ -259,7 +276,8 @@ def _pair(a: Group, b: Group, metric: str) -> Pair:
     sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
     better = statistics.probability_of_improvement(sign * first, sign * second)
     difference = statistics.difference(first, second)
-    return Pair(a.name, b.name, metric, point, difference, better, min(len(first), len(second)))
+    equivalence = None if margin is None else statistics.equivalent(first, second, margin)
+    return Pair(a.name, b.name, metric, point, difference, better, min(len(first), len(second)), equivalence)
 
 
 def _differences(groups: Sequence[Group]) -> dict[str, tuple[Any, ...]]:

@@ -30,6 +30,7 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
                 "interval": _bounds(pair.difference),
                 "detectable": None if pair.difference is None else pair.difference.detectable,
                 "verdict": pair.verdict,
+                "equivalence": None if pair.equivalence is None else pair.equivalence._asdict(),
                 "probability_of_improvement": None if pair.better is None else pair.better.point,
                 "probability_of_improvement_interval": _bounds(pair.better),
                 "claimed": pair.claimed,

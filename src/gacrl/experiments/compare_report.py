@@ -58,6 +58,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
             page.text(note[:1].upper() + note[1:] + ".")
     for listing in _listings(comparison, None):
         page.table(listing.columns, listing.rows, listing.caption)
+    page.table(("metric", "", "mean", "median"), _summaries(comparison), "other statistics of the same seeds")
     for metric in comparison.metrics:
         page.heading(metric)
         lines = {who: comparison.reference(who, metric) for who in comparison.references}
@@ -135,10 +136,9 @@ def _results(comparison: Comparison) -> _Listing:
 
 
 def _estimate(group: Group, metric: str) -> str:
-    found = group.estimate(metric)
-    if found is None:
+    if len(group.seeds) == 1:
         return f"{group.point(metric):.3f} (one seed: no interval)"
-    return f"{found.point:.3f} [{found.low:.3f}, {found.high:.3f}]"
+    return _interval(group.final[metric], statistics.iqm)
 
 
 def _pair_row(pair: Pair) -> tuple[str, ...]:
@@ -149,11 +149,37 @@ def _pair_row(pair: Pair) -> tuple[str, ...]:
     return (
         *start,
         f"{difference.point:.3f} [{difference.low:.3f}, {difference.high:.3f}]",
-        str(pair.verdict),
+        f"{pair.verdict}{_equivalence(pair)}",
         f"{difference.detectable:.3f}",
         f"{better.point:.2f} [{better.low:.2f}, {better.high:.2f}]",
         pair.claimed or "no",
     )
+
+
+def _equivalence(pair: Pair) -> str:
+    if pair.equivalence is None:
+        return ""
+    test = pair.equivalence
+    found = "equivalent" if test.equivalent else "not shown to be equivalent"
+    return f"; {found} within {test.margin:g} (p = {test.p_value:.2g})"
+
+
+def _summaries(comparison: Comparison) -> list[tuple[str, ...]]:
+    """Means and medians with their intervals, beside which the interquartile mean is to be seen."""
+    return [
+        (metric, group.name, *(_interval(group.final[metric], statistic) for statistic in _STATISTICS))
+        for metric in comparison.metrics
+        for group in comparison.groups
+        if len(group.seeds) > 1
+    ]
+
+
+_STATISTICS = (statistics.mean, statistics.median)
+
+
+def _interval(values: Any, statistic: Any) -> str:
+    found = statistics.estimate(values, statistic)
+    return f"{found.point:.3f} [{found.low:.3f}, {found.high:.3f}]"
 
 
 def _series(group: Group, metric: str) -> Any:

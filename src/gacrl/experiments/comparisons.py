@@ -136,16 +136,12 @@ def value(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
         measure = reading.measure(name)
         ours, random = _expected(measure, who, stretch, reading, evidence)
         as_random, as_ours = _inside(printed, random), _inside(printed, ours)
-        verdicts.append(AS_RANDOM if as_random else HOLDS if as_ours else IRREPRODUCIBLE)
+        verdicts.append(_printed(printed, ours, random))
         place = "in both" if as_random and as_ours else "in random's" if as_random else "in neither"
         place = "in ours" if as_ours and not as_random else place
         said.append(f"{who} {measure.label} {printed:g}: ours {_span(ours)}, random {_span(random)}, {place}")
-    verdict = AS_RANDOM
-    if IRREPRODUCIBLE in verdicts:
-        verdict = IRREPRODUCIBLE
-    elif HOLDS in verdicts:
-        verdict = HOLDS
-    return Outcome(verdict, "; ".join(said))
+    weakest: tuple[Verdict, ...] = (IRREPRODUCIBLE, OPEN, HOLDS, AS_RANDOM)
+    return Outcome(next(it for it in weakest if it in verdicts), "; ".join(said))
 
 
 def peak(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
@@ -163,9 +159,7 @@ def peak(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     episode = claim.settings["episode"]
     if str(episode) not in paper_tables.printed()["table_2"]["rows"]:
         because += f"; episode {episode} is not in Table II"
-    if _inside(printed, random):
-        return Outcome(AS_RANDOM, because)
-    return Outcome(HOLDS if _inside(printed, ours) else IRREPRODUCIBLE, because)
+    return Outcome(_printed(printed, ours, random), because)
 
 
 def trend(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
@@ -246,10 +240,7 @@ def duration(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     full = series.config.curriculum.episodes
     hours = series.seconds / 3600 / len(series.config.seeds) * full / episodes
     printed = claim.settings["hours"]
-    because = (
-        f"here {60 * hours:.2g} minutes a seed for {full} episodes, on this machine's CPU; "
-        f"printed {printed:g} hours"
-    )
+    because = f"here {60 * hours:.2g} minutes a seed for {full} episodes; printed {printed:g} hours"
     return Outcome(HOLDS if 0.5 < hours / printed < 2 else IRREPRODUCIBLE, because)
 
 
@@ -324,6 +315,15 @@ def _expected(
     return _next_run(measured(measure.weights, logged)[:, stretch]), random
 
 
+def _printed(number: float, ours: Span, random: Span) -> Verdict:
+    """A printed number's verdict; ours decides nothing where it has all of random's interval in it."""
+    if _inside(number, random):
+        return AS_RANDOM
+    if not _inside(number, ours):
+        return IRREPRODUCIBLE
+    return OPEN if ours[0] <= random[0] and random[1] <= ours[1] else HOLDS
+
+
 def _next_run(values: Float[np.ndarray, " S"]) -> Span:
     """95 % prediction interval of one more seed."""
     half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) * np.sqrt(1 + 1 / len(values))
@@ -365,5 +365,5 @@ def _listed(differences: Mapping[str, Difference], measure: Measure) -> str:
     said: list[str] = []
     for who, d in differences.items():
         low, high = sorted((measure.sign * d.low, measure.sign * d.high))
-        said.append(f"{who} {measure.sign * d.point:+.3g} [{low:.3g}, {high:.3g}]")
+        said.append(f"{who} {measure.sign * d.point:+.3g} [{low:.3g}, {high:.3g}], detectable {d.detectable:.2g}")
     return "; ".join(said)

@@ -57,6 +57,12 @@ def load(path: Path, warn: Warn) -> Finished:
         shape = {"final": dict, "references": dict, "episodes": int, "horizon": int, "seeds": list}
         if not all(isinstance(summary[name], kind) for name, kind in shape.items()):
             raise ValueError("it lacks what a run's summary has")
+        planned = config.num_updates * config.steps_per_update
+        if summary.get("env_steps", planned) != planned:
+            raise UserError(
+                f"{path} has trained {summary['env_steps']} of {planned} environment steps, and was measured then: "
+                f"`gacrl resume {path}` ends it"
+            )
         if summary["seeds"] != list(config.seeds):
             raise ValueError(f"it is of seeds {summary['seeds']}, config.json of {list(config.seeds)}")
         rows = folder.metrics()

@@ -5,6 +5,7 @@ as seeds are. Results are kept as they come: a stopped sweep goes on with the me
 """
 
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -25,6 +26,8 @@ from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.training import session
 from gacrl.training.devices import shard_seeds, stack_seeds
+from gacrl.training.divergence import not_finite
+from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
 
 SCORE = "reward_shaped"
@@ -106,7 +109,7 @@ class Sweep:
             "out": str(self.out),
             "report": str(self.report),
             "winner": self.winner._asdict(),
-            "means": [{**point._asdict(), "mean": mean} for point, mean in self.means.items()],
+            "means": [{**point._asdict(), "mean": _number(mean)} for point, mean in self.means.items()],
             "noise": asdict(self.noise),
             "confirmed": [{**point._asdict(), "values": values} for point, values in self.confirmed.items()],
         }
@@ -140,6 +143,11 @@ def sweep(
     """
     asked = {**asdict(grid), "choice": grid.choice._asdict(), "config": configuration.to_dict(grid.config)}
     claim_folder(out, _MARKER, asked, "sweep", lambda held: "a sweep of other settings: choose another --out")
+    with RunFolder(out).locked():
+        return _sweep(grid, out, say, together)
+
+
+def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | None) -> Sweep:
     members = [Member(point, seed) for point in grid.points for seed in grid.seeds]
     if together is None:
         together = 3 * jax.local_device_count() if jax.default_backend() == "cpu" else len(members)
@@ -153,7 +161,10 @@ def sweep(
     scores = _train_missing(grid, trainer, again, out, say)
     confirmed = {point: tuple(scores[Member(point, seed)] for seed in grid.fresh_seeds) for point in finalists}
     table = np.array([[scores[Member(point, seed)] for seed in grid.seeds] for point in grid.points])
-    done = Sweep(out, out / "report.html", winner, means, noise_of(table), confirmed)
+    finite = table[np.isfinite(table).all(1)]
+    if len(finite) < 2:
+        raise UserError(f"all settings but {len(finite)} diverged: there is nothing to compare")
+    done = Sweep(out, out / "report.html", winner, means, noise_of(finite), confirmed)
     _report(grid, scores, done)
     return done
 
@@ -198,7 +209,10 @@ def _train_missing(
 
 
 def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[[str], None]) -> list[float]:
-    """The mean score of each member's episodes; a group that is not full is filled up with its last member."""
+    """The mean score of each member's episodes; −∞ where it diverged, since whoever then stands still scores well.
+
+    A group that is not full is filled up with its last member.
+    """
     filled = [*group, *[group[-1]] * (trainer.num_seeds - len(group))]
     states = [trainer.init_member(stream_key("training", seed), _hyper(trainer, point)) for point, seed in filled]
     state = shard_seeds(stack_seeds(states), trainer.mesh)
@@ -212,7 +226,11 @@ def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[
         total += episodes.total[: len(group), place]
         ended += episodes.ended[: len(group)]
         say(f"  episode {int(ended[0])}: shaped reward so far {np.mean(total / np.maximum(ended, 1)):.2f}")
-    return [float(score) for score in total / ended]
+    numbers = range(len(filled))
+    diverged = {number for number, _, _ in not_finite(numbers, [{}] * len(filled), state.learner)}
+    return [
+        -math.inf if number in diverged else float(total[number] / ended[number]) for number in range(len(group))
+    ]
 
 
 def _hyper(trainer: Trainer, point: Point) -> Any:
@@ -228,23 +246,30 @@ def _read(out: Path) -> Scores:
     """The results so far; a line that a crash cut off, or that is no result, is left out and trained again."""
     scores: Scores = {}
     path = out / _RESULTS
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+    for line in path.read_bytes().splitlines() if path.is_file() else []:
         try:
             row = json.loads(line)
             point = Point(row["learning_rate"], row["epsilon"], row["temperature"])
-            scores[Member(point, row["seed"])] = float(row[SCORE])
+            score = -math.inf if row[SCORE] is None else float(row[SCORE])
+            if score < math.inf:
+                scores[Member(point, row["seed"])] = score
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return scores
 
 
 def _append(out: Path, found: Scores) -> None:
-    rows = [{**point._asdict(), "seed": seed, SCORE: score} for (point, seed), score in found.items()]
-    with (out / _RESULTS).open("a+", encoding="utf-8") as file:
+    rows = [{**point._asdict(), "seed": seed, SCORE: _number(score)} for (point, seed), score in found.items()]
+    with (out / _RESULTS).open("ab+") as file:
         file.seek(0)
         before = file.read()
-        cut_off = before and not before.endswith("\n")
-        file.write(("\n" if cut_off else "") + "".join(json.dumps(row) + "\n" for row in rows))
+        cut_off = before and not before.endswith(b"\n")
+        file.write((("\n" if cut_off else "") + "".join(json.dumps(row) + "\n" for row in rows)).encode())
+
+
+def _number(score: float) -> float | None:
+    """None for what diverged: JSON has no infinity."""
+    return score if math.isfinite(score) else None
 
 
 def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
@@ -274,8 +299,8 @@ def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
     rows = [
         [
             *(f"{number:g}" for number in point),
-            f"{done.means[point]:.3f}",
-            ", ".join(f"{scores[Member(point, seed)]:.3f}" for seed in grid.seeds),
+            _told(done.means[point]),
+            ", ".join(_told(scores[Member(point, seed)]) for seed in grid.seeds),
             ", ".join(name for name, it in (("winner", done.winner), ("the paper's", grid.choice)) if it == point),
         ]
         for point in grid.points
@@ -317,6 +342,10 @@ def _confirmation(page: Page, grid: Grid, done: Sweep) -> None:
 
 def _listed(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
+
+
+def _told(score: float) -> str:
+    return f"{score:.3f}" if math.isfinite(score) else "diverged"
 
 
 def _labels(numbers: Sequence[float]) -> list[str]:
