@@ -51,8 +51,14 @@ def instructions() -> dict[str, int]:
 def fallen(
     name: str, now: Mapping[str, Mapping[str, Sequence[float]]], before: Mapping[str, Mapping[str, float]]
 ) -> list[str]:
-    """Print the table of these ratios; those that fell too far."""
-    found: list[str] = []
+    """Print the table of these ratios; those that fell too far, and those of before that were not measured."""
+    found = [
+        f"{name}: {peer} at {size} (not measured)"
+        for peer, sizes in before.items()
+        for size in sizes
+        if size not in now.get(peer, {})
+    ]
+    print("".join(f"{label}\n" for label in found), end="")
     for peer, sizes in now.items():
         for size, values in sizes.items():
             was, ratio = before.get(peer, {}).get(size), statistics.median(values)
@@ -90,11 +96,14 @@ def main() -> None:
         ratios = environment.compare(asked.rounds, asked.core)
         bad += fallen("environment", ratios, baseline.get("environment", {}))
         measured = {"environment": peers.summary(ratios)["ratio"]}
+    missing = [label for label in bad if label.endswith("(not measured)")]
+    if asked.write and missing:
+        sys.exit(f"{BASELINE.name} stays as it was: {'; '.join(missing)}")
     if asked.write:
         baseline |= {"jax": jax.__version__, "instructions": counts, **measured}
         BASELINE.write_text(json.dumps(baseline, indent=2) + "\n", encoding="utf-8")
     elif bad:
-        sys.exit(f"slower than {BASELINE.name} by more than {TOLERANCE:.0%}: {'; '.join(bad)}")
+        sys.exit(f"slower than {BASELINE.name} by more than {TOLERANCE:.0%}, or missing: {'; '.join(bad)}")
 
 
 if __name__ == "__main__":

@@ -155,6 +155,7 @@ def compare(rounds: int, core: int, checkout: str | None) -> dict[str, dict[str,
             peer = peers.Side("jaxmarl", peers.python_of("jaxmarl") or "", __file__, core)
     if peer:
         peer.close()
+    print("epymarl is in no package index: it cannot be installed here, and is left out", flush=True)
     python = peers.python_of("benchmarl")
     for shapes, name, algorithms in (
         ("shipped", "benchmarl as shipped", ("ippo", "mappo", "qmix")),
