@@ -361,6 +361,11 @@ def test_a_run_that_has_not_ended_is_refused(make_run: MakeRun, refused: Callabl
         ("summary.json", lambda t: t.replace("-8.0, ", "", 1), "{file} has no greedy return_agent_mean of seed 4"),
         ("summary.json", lambda t: t[:40], "{file} is damaged: "),
         ("summary.json", lambda t: "[]", "{file} is damaged: "),
+        (
+            "summary.json",
+            lambda t: json.dumps({**json.loads(t), "final": {"greedy": {}, "sampled": None}}),
+            "{file} is damaged: it lacks a closing evaluation",
+        ),
         ("config.json", lambda t: t[:40], "{file} is not JSON: "),
     ],
 )

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from gacrl import config as configuration
 from gacrl.config import RunConfig
@@ -57,6 +57,8 @@ def load(path: Path, warn: Warn) -> Finished:
         shape = {"final": dict, "references": dict, "episodes": int, "horizon": int, "seeds": list}
         if not all(isinstance(summary[name], kind) for name, kind in shape.items()):
             raise ValueError("it lacks what a run's summary has")
+        if not all(isinstance(summary["final"].get(play), dict) for play in get_args(Play)):
+            raise ValueError("it lacks a closing evaluation")
         planned = config.num_updates * config.steps_per_update
         if summary.get("env_steps", planned) != planned:
             raise UserError(
