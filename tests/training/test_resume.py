@@ -24,6 +24,7 @@ import safetensors.numpy
 from conftest import TinyRun
 
 from gacrl import config as configuration
+from gacrl.algorithms.replay import Replay
 from gacrl.cli import main
 from gacrl.errors import UserError
 from gacrl.experiments import paper_tables
@@ -251,6 +252,22 @@ def test_a_state_loads_as_it_was_saved(tmp_path: Path):
             np.testing.assert_array_equal(leaf, original)
     draw, again = (jax.random.normal(state["key"], (3,)) for state in (STATE, loaded))
     np.testing.assert_array_equal(draw, again)
+
+
+def test_empty_rows_are_not_written_and_are_there_again(tmp_path: Path):
+    """Two seeds' rings of four rows of two environments, three of them filled; a full ring is written whole."""
+    items = jnp.arange(48.0).reshape(2, 4, 2, 3) + 1
+    for added, rows in ((3, 3), (4, 4), (9, 4)):
+        ring = jax.vmap(Replay)(items.at[:, rows:].set(0.0), jnp.full(2, added, jnp.int32))
+        named = {f".learner.replay{name}": array for name, array in checkpoint.arrays(ring).items()}
+        cut = checkpoint.without_empty_rows(named)
+        assert cut[".learner.replay.items"].shape == (2, rows, 2, 3)
+        checkpoint.save(tmp_path, checkpoint.serialise(cut), added, "", {})
+        found, _ = checkpoint.newest(tmp_path)
+        loaded = checkpoint.load(found, ring, prefix=".learner.replay")
+        np.testing.assert_array_equal(loaded.items, ring.items)
+    with pytest.raises(UserError, match="holds another architecture"):
+        checkpoint.load(found, jax.vmap(Replay)(items[:, :3], ring.added), prefix=".learner.replay")
 
 
 def test_a_part_of_a_state_can_be_loaded(tmp_path: Path):

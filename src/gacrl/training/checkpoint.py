@@ -29,6 +29,9 @@ STEP, BEST = "step-", "best-"
 KEPT = {STEP: 2, BEST: 1}
 """Newest of each kind that stay; of the whole states the one before is there should the newest be damaged."""
 
+RING, ADDED = ".replay.items", ".replay.added"
+"""In the paths of what is remembered, [seeds, rows, …], and of how many rows were ever added, [seeds]."""
+
 _TENSORS, _MANIFEST, _UNFINISHED, _DAMAGED = "state.safetensors", "manifest.json", ".unfinished-", ".damaged-"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, RecursionError, safetensors.SafetensorError)
 Tree = TypeVar("Tree", bound=PyTree)
@@ -53,6 +56,16 @@ def arrays(state: PyTree) -> dict[str, np.ndarray]:
         return np.asarray(leaf, order="C")
 
     return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
+
+
+def without_empty_rows(named: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same, what is remembered cut to the filled rows; the others are zeros, and `load` makes them again."""
+
+    def cut(name: str, array: np.ndarray) -> np.ndarray:
+        before, ring, _ = name.partition(RING)
+        return np.ascontiguousarray(array[:, : named[before + ADDED].max()]) if ring else array
+
+    return {name: cut(name, array) for name, array in named.items()}
 
 
 def serialise(named: Mapping[str, np.ndarray]) -> bytes:
@@ -152,7 +165,11 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
             found = None
             if name in saved:
                 with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
-                    found = file.get_tensor(name)
+                    found = (
+                        _with_empty_rows(file.get_tensor(name), wanted.shape)
+                        if RING in name
+                        else file.get_tensor(name)
+                    )
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
                 raise UserError(
@@ -162,6 +179,13 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
             array = jnp.asarray(found)
             loaded.append(jax.random.wrap_key_data(array) if is_key else array)
     return jax.tree_util.tree_unflatten(structure, loaded)
+
+
+def _with_empty_rows(saved: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """What `without_empty_rows` took away is there again; an array that differs otherwise stays as it is."""
+    if saved.ndim != len(shape) or saved.shape[1] >= shape[1]:
+        return saved
+    return np.pad(saved, [(0, shape[1] - saved.shape[1] if axis == 1 else 0) for axis in range(saved.ndim)])
 
 
 def _inspect(folder: Path) -> Checkpoint:

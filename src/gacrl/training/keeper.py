@@ -30,7 +30,8 @@ class Keeper:
         self._best = _best_score(folder.checkpoints)
 
     def __call__(self, progress: Progress) -> None:
-        state, env_steps = checkpoint.arrays(without_padding(progress.whole, self._num_seeds)), progress.env_steps
+        state = checkpoint.without_empty_rows(checkpoint.arrays(without_padding(progress.whole, self._num_seeds)))
+        env_steps = progress.env_steps
         self._rows += len(progress.rows)
         counters = {**asdict(progress.clock), ROWS: self._rows}
         writes = [partial(self._save, checkpoint.serialise(state), env_steps, counters=counters)]
