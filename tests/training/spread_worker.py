@@ -53,7 +53,16 @@ def on_mesh(config: RunConfig, devices: np.ndarray) -> Trainer:
     """A trainer on devices [seeds, envs]."""
     built, mesh = session.build(config), Mesh(devices, ("seeds", ENVS))
     num_envs, num_steps = config.training.num_envs, config.training.num_steps
-    return Trainer(built.algorithm, built.env, built.curriculum, num_envs, num_steps, config.num_seeds, mesh=mesh)
+    return Trainer(
+        built.algorithm,
+        built.env,
+        built.curriculum,
+        num_envs,
+        num_steps,
+        config.num_seeds,
+        mesh=mesh,
+        for_speed=built.for_speed,
+    )
 
 
 def after_ten_updates(trainer: Trainer, config: RunConfig) -> dict[str, np.ndarray]:

@@ -75,13 +75,14 @@ class Trainer:
         mesh: Mesh | None = None,
         for_speed: bool = True,
     ):
-        """for_speed: what `devices.compiler_options` makes of it."""
         self.algorithm = algorithm
         self.env = env
         self.curriculum = curriculum
         self.num_envs = num_envs
         self.num_steps = num_steps
         self.num_seeds = num_seeds
+        self.for_speed = for_speed
+        """How `chunk` is compiled: see `devices.compiler_options`."""
         self.evaluation_env = env if evaluation_env is None else evaluation_env
         self.mesh = mesh_for(num_seeds) if mesh is None else mesh
         """The devices that the seeds, and perhaps their environments, are spread over."""
