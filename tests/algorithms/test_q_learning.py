@@ -42,7 +42,9 @@ class Table(AgentNetwork):
     def initial_memory(self, num_agents: int) -> Any:
         return AgentMemory(jnp.zeros((num_agents, 1)), ()) if self.remembers else ()
 
-    def __call__(self, observation: Observation, memory: Any = (), *unused: Any) -> tuple[AgentOutput, Any]:
+    def __call__(
+        self, observation: Observation, memory: Any = (), *unused: Any, temperature: Any = None
+    ) -> tuple[AgentOutput, Any]:
         head = self.scale[0] * observation.features[:, :A]
         if isinstance(memory, AgentMemory):
             head, memory = head + 0.5 * memory.carry, AgentMemory(memory.carry + 1, ())

@@ -340,7 +340,7 @@ def test_what_is_in_the_way_is_told_before_anything_is_trained(
         shutil.rmtree(copy / name)
         (copy / name).touch()
     elif name.endswith("gif"):
-        (copy / name).rename(copy.parent / "elsewhere.gif")
+        (copy / name).unlink(missing_ok=True)
         (copy / name).symlink_to(copy.parent / "elsewhere.gif")
     else:
         (copy / name).unlink()
