@@ -165,11 +165,9 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
             found = None
             if name in saved:
                 with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
-                    found = (
-                        _with_empty_rows(file.get_tensor(name), wanted.shape)
-                        if RING in name
-                        else file.get_tensor(name)
-                    )
+                    found = file.get_tensor(name)
+            if found is not None and RING in name:
+                found = _with_empty_rows(found, wanted.shape)
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
                 raise UserError(
