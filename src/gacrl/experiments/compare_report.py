@@ -11,12 +11,15 @@ from rich.console import Console
 from rich.table import Table
 
 from gacrl.evaluation import statistics
+from gacrl.evaluation.statistics import Difference, Estimate
 from gacrl.experiments.compare import LOWER_IS_BETTER, Comparison, Group, Pair
 
 PAGE = "comparison"
 """The page's name in its folder."""
 _SHOWN_DIFFERENCES = 12
 """Settings listed in the terminal; the page and the JSON have all."""
+_STATISTICS = (statistics.mean, statistics.median)
+"""What a page has beside the interquartile mean."""
 _MARKS = 101
 """Thresholds of a performance profile."""
 
@@ -58,7 +61,8 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
             page.text(note[:1].upper() + note[1:] + ".")
     for listing in _listings(comparison, None):
         page.table(listing.columns, listing.rows, listing.caption)
-    page.table(("metric", "", "mean", "median"), _summaries(comparison), "other statistics of the same seeds")
+    if summaries := _summaries(comparison):
+        page.table(("metric", "", "mean", "median"), summaries, "other statistics of the same seeds")
     for metric in comparison.metrics:
         page.heading(metric)
         lines = {who: comparison.reference(who, metric) for who in comparison.references}
@@ -136,9 +140,8 @@ def _results(comparison: Comparison) -> _Listing:
 
 
 def _estimate(group: Group, metric: str) -> str:
-    if len(group.seeds) == 1:
-        return f"{group.point(metric):.3f} (one seed: no interval)"
-    return _interval(group.final[metric], statistics.iqm)
+    found = group.estimate(metric)
+    return f"{group.point(metric):.3f} (one seed: no interval)" if found is None else _interval(found)
 
 
 def _pair_row(pair: Pair) -> tuple[str, ...]:
@@ -148,7 +151,7 @@ def _pair_row(pair: Pair) -> tuple[str, ...]:
     difference, better = pair.difference, pair.better
     return (
         *start,
-        f"{difference.point:.3f} [{difference.low:.3f}, {difference.high:.3f}]",
+        _interval(difference),
         f"{pair.verdict}{_equivalence(pair)}",
         f"{difference.detectable:.3f}",
         f"{better.point:.2f} [{better.low:.2f}, {better.high:.2f}]",
@@ -167,18 +170,14 @@ def _equivalence(pair: Pair) -> str:
 def _summaries(comparison: Comparison) -> list[tuple[str, ...]]:
     """Means and medians with their intervals, beside which the interquartile mean is to be seen."""
     return [
-        (metric, group.name, *(_interval(group.final[metric], statistic) for statistic in _STATISTICS))
+        (metric, group.name, *(_interval(statistics.estimate(group.final[metric], it)) for it in _STATISTICS))
         for metric in comparison.metrics
         for group in comparison.groups
         if len(group.seeds) > 1
     ]
 
 
-_STATISTICS = (statistics.mean, statistics.median)
-
-
-def _interval(values: Any, statistic: Any) -> str:
-    found = statistics.estimate(values, statistic)
+def _interval(found: Estimate | Difference) -> str:
     return f"{found.point:.3f} [{found.low:.3f}, {found.high:.3f}]"
 
 
