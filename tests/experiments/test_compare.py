@@ -129,6 +129,8 @@ def test_a_margin_tests_for_equivalence(
 ):
     runs = make_run("a", VDN, HIGH), make_run("b", MAPPO, [value + 0.1 for value in HIGH])
     assert refused(*runs, "--margin", 2) == "a margin is in the units of a metric: name one with --metric"
+    unusable = (runs[0], "--metric", "return_agent_mean", "--margin", -1)
+    assert refused(*unusable) == "the margin of an equivalence must be positive, not -1.0"
     for margin, told in (
         (2.0, "; equivalent within 2 (p = "),
         (0.2, "; not shown to be equivalent within 0.2 (p = "),

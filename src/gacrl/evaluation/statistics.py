@@ -70,6 +70,12 @@ class Curve(NamedTuple):
     high: Floats
 
 
+def with_interval(found: Estimate | Difference | tuple[float, float, float], form: str = ".3f") -> str:
+    """A number and its bounds, to be read: "0.973 [0.971, 0.976]"."""
+    point, low, high = (f"{number:{form}}" for number in found[:3])
+    return f"{point} [{low}, {high}]"
+
+
 def iqm(values: Numbers) -> Any:
     """Interquartile mean: of all S × K scores, without the ⌊S K / 4⌋ lowest and as many of the highest.
 
@@ -153,8 +159,7 @@ def equivalent(a: Numbers, b: Numbers, margin: float) -> Equivalence:
     That an interval includes 0 shows no equality; only this does. Scores as for `difference`; of K tasks it is
     the means over tasks that are compared. Raises UserError for a margin that is not positive.
     """
-    if not margin > 0:
-        raise UserError(f"the margin of an equivalence must be positive, not {margin}")
+    require_margin(margin)
     first, second = _checked_pair(a, b)
     point = float((first.mean(0) - second.mean(0)).mean())
     tasks = first.shape[1]
@@ -167,6 +172,12 @@ def equivalent(a: Numbers, b: Numbers, margin: float) -> Equivalence:
         degrees = shares.sum() ** 2 / (shares**2 / freedom).sum()  # Welch-Satterthwaite
         p_value = float(stats.t.sf((margin - abs(point)) / error, degrees))
     return Equivalence(point, float(margin), p_value, p_value < 1 - CONFIDENCE)
+
+
+def require_margin(margin: float) -> None:
+    """Raises UserError for one that is not positive."""
+    if not margin > 0:
+        raise UserError(f"the margin of an equivalence must be positive, not {margin}")
 
 
 def performance_profile(values: Numbers, thresholds: Numbers, reps: int = 2000, seed: int = 0) -> Curve:

@@ -19,7 +19,15 @@ from gacrl.algorithm_config import GacrlConfig
 from gacrl.algorithms.actions import choices
 from gacrl.config import RunConfig
 from gacrl.errors import UserError
-from gacrl.evaluation.statistics import Curve, detectable, estimate, probability_of_improvement, sample_efficiency
+from gacrl.evaluation.statistics import (
+    Curve,
+    Estimate,
+    detectable,
+    estimate,
+    probability_of_improvement,
+    sample_efficiency,
+    with_interval,
+)
 from gacrl.experiments.study import (
     Planned,
     Watch,
@@ -246,11 +254,11 @@ def _data(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def _worth(full: Outcome, without: Outcome) -> list[float] | None:
+def _worth(full: Outcome, without: Outcome) -> Estimate | None:
     """P(a seed with all parts scores higher than one without this), and its interval."""
     if without is full or not full.final or not without.final:
         return None
-    return list(probability_of_improvement(full.final[SCORE], without.final[SCORE]))
+    return probability_of_improvement(full.final[SCORE], without.final[SCORE])
 
 
 def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome]) -> Path:
@@ -272,8 +280,11 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
             cells = [f"diverged: {outcome.diverged}", *[""] * (len(METRICS) + 1)]
         else:
             worth = _worth(outcomes[0], outcome)
-            cells = [_interval(estimate(values)) for values in outcome.final.values()]
-            cells += ["", ""] if worth is None else [_interval(worth, 2), _detectable(outcomes[0], outcome)]
+            cells = [with_interval(estimate(values)) for values in outcome.final.values()]
+            if worth is None:
+                cells += ["", ""]
+            else:
+                cells += [with_interval(worth, ".2f"), _detectable(outcomes[0], outcome)]
         rows.append([outcome.name, says, f"{outcome.parameters:,}", *cells])
     page.table(("", "what it is", "parameters", *METRICS, "P(the part helps)", "detectable"), rows)
     page.text(
@@ -333,11 +344,6 @@ def _detectable(full: Outcome, without: Outcome) -> str:
 def _updates(config: RunConfig) -> int:
     assert isinstance(config.algorithm, GacrlConfig)
     return config.algorithm.updates
-
-
-def _interval(found: Sequence[float], digits: int = 3) -> str:
-    point, low, high = (f"{number:.{digits}f}" for number in found)
-    return f"{point} [{low}, {high}]"
 
 
 def _series(outcome: Outcome, curve: Curve) -> figures.Series:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gacrl.evaluation import statistics
-from gacrl.evaluation.statistics import Difference, Estimate
+from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare import LOWER_IS_BETTER, Comparison, Group, Pair
 
 PAGE = "comparison"
@@ -141,7 +141,7 @@ def _results(comparison: Comparison) -> _Listing:
 
 def _estimate(group: Group, metric: str) -> str:
     found = group.estimate(metric)
-    return f"{group.point(metric):.3f} (one seed: no interval)" if found is None else _interval(found)
+    return f"{group.point(metric):.3f} (one seed: no interval)" if found is None else with_interval(found)
 
 
 def _pair_row(pair: Pair) -> tuple[str, ...]:
@@ -151,10 +151,10 @@ def _pair_row(pair: Pair) -> tuple[str, ...]:
     difference, better = pair.difference, pair.better
     return (
         *start,
-        _interval(difference),
+        with_interval(difference),
         f"{pair.verdict}{_equivalence(pair)}",
         f"{difference.detectable:.3f}",
-        f"{better.point:.2f} [{better.low:.2f}, {better.high:.2f}]",
+        with_interval(better, ".2f"),
         pair.claimed or "no",
     )
 
@@ -170,15 +170,11 @@ def _equivalence(pair: Pair) -> str:
 def _summaries(comparison: Comparison) -> list[tuple[str, ...]]:
     """Means and medians with their intervals, beside which the interquartile mean is to be seen."""
     return [
-        (metric, group.name, *(_interval(statistics.estimate(group.final[metric], it)) for it in _STATISTICS))
+        (metric, group.name, *(with_interval(statistics.estimate(group.final[metric], it)) for it in _STATISTICS))
         for metric in comparison.metrics
         for group in comparison.groups
         if len(group.seeds) > 1
     ]
-
-
-def _interval(found: Estimate | Difference) -> str:
-    return f"{found.point:.3f} [{found.low:.3f}, {found.high:.3f}]"
 
 
 def _series(group: Group, metric: str) -> Any:

@@ -13,7 +13,7 @@ from typing import Any
 from gacrl import config as configuration
 from gacrl.config import RunConfig
 from gacrl.envs.scripted import SCRIPTED
-from gacrl.evaluation.statistics import probability_of_improvement
+from gacrl.evaluation.statistics import probability_of_improvement, with_interval
 from gacrl.experiments import reproduce_tables
 from gacrl.experiments.claims import Judged, untrained
 from gacrl.experiments.evidence import COLUMNS, Evidence
@@ -161,7 +161,7 @@ def _extended(page: Page, evidence: Evidence) -> None:
     for who, series in runs.items():
         if who != "GACRL":
             ahead = [probability_of_improvement(own[name], series.final["greedy"][name]) for name in judged_by]
-            rows.append([who, *(f"{p.point:.2f} [{p.low:.2f}, {p.high:.2f}]" for p in ahead)])
+            rows.append([who, *(with_interval(p, ".2f") for p in ahead)])
     page.table(("against", *(shown[name] for name in judged_by)), rows)
 
 

@@ -13,7 +13,7 @@ from gacrl import envs
 from gacrl.config import EnvConfig
 from gacrl.envs.scripted import SCRIPTED
 from gacrl.evaluation.evaluate import stream_key
-from gacrl.evaluation.statistics import estimate, sample_efficiency
+from gacrl.evaluation.statistics import estimate, sample_efficiency, with_interval
 from gacrl.experiments import paper_tables
 from gacrl.experiments.claims import Measure, Reading, claims, measures
 from gacrl.experiments.comparisons import ROUNDING, best_of_random, random_interval
@@ -242,7 +242,7 @@ def printed_numbers(page: Page, evidence: Evidence) -> None:
                     measure.label,
                     who,
                     f"{printed:g}",
-                    f"{random.mean():.3g} [{low:.3g}, {high:.3g}]",
+                    with_interval((float(random.mean()), low, high), ".3g"),
                     "inside" if within else "outside",
                     f"{noop.mean():.3g}, {'better' if ahead else 'not better'}",
                     f"{oracle.mean():.3g}",
@@ -327,7 +327,7 @@ def _with_range(values: Float[np.ndarray, " S"]) -> str:
 
 def _with_span(episodes: Float[np.ndarray, " E"]) -> str:
     low, high = np.percentile(episodes, [2.5, 97.5])
-    return f"{episodes.mean():.3g} [{low:.3g}, {high:.3g}]"
+    return with_interval((float(episodes.mean()), float(low), float(high)), ".3g")
 
 
 def _file(*words: str) -> str:
@@ -336,5 +336,4 @@ def _file(*words: str) -> str:
 
 def interquartile(values: Float[np.ndarray, " S"]) -> str:
     """The IQM of the seeds and its interval, to be read."""
-    found = estimate(values)
-    return f"{found.point:.3g} [{found.low:.3g}, {found.high:.3g}]"
+    return with_interval(estimate(values), ".3g")
