@@ -102,14 +102,13 @@ def no_episodes(measures: Sequence[str]) -> EpisodeSummary:
     return EpisodeSummary(jnp.zeros((), jnp.int32), zeros, zeros, zeros)
 
 
-def count_episodes(
-    summary: EpisodeSummary, episodes: Float[Array, "E K"], done: Bool[Array, " E"]
-) -> EpisodeSummary:
-    """Take in the episodes of those environments that are done."""
-    finished = jnp.where(done[:, None], episodes, 0.0)
+def sum_up(episodes: Float[Array, "T E K"], done: Bool[Array, "T E"]) -> EpisodeSummary:
+    """The episodes that ended in a rollout; of several that ended last, the first environment's is `last`."""
+    finished = jnp.where(done[..., None], episodes, 0.0)
+    when = done.shape[0] - 1 - jnp.argmax(done.any(1)[::-1])
     return EpisodeSummary(
-        ended=summary.ended + done.sum(),
-        total=summary.total + finished.sum(0),
-        squares=summary.squares + jnp.square(finished).sum(0),
-        last=jnp.where(done.any(), episodes[jnp.argmax(done)], summary.last),
+        ended=done.sum(),
+        total=finished.sum((0, 1)),
+        squares=jnp.square(finished).sum((0, 1)),
+        last=finished[when, jnp.argmax(done[when])],
     )

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from gacrl import rollout
 from gacrl.algorithms.algorithm import Algorithm, Hyper
@@ -19,12 +19,12 @@ from gacrl.evaluation.evaluate import Stream, evaluate, stream_key
 from gacrl.evaluation.metrics import (
     EpisodeSummary,
     Tally,
-    count_episodes,
     count_step,
     episode_metrics,
     metric_names,
     no_episodes,
     no_steps,
+    sum_up,
 )
 from gacrl.training.curriculum import Curriculum, CurriculumState
 from gacrl.training.devices import compiler_options, map_seeds, mesh_for, shard_seeds, stack_seeds
@@ -148,22 +148,21 @@ class Trainer:
         """Follow the episodes of a rollout, and sum up those that ended in it."""
         fresh = no_steps(self.measures)
 
-        def one_step(loop: tuple[Tally, EpisodeSummary], step: Any):
-            tally, summary = loop
+        def one_step(tally: Tally, step: tuple[Any, Bool[Array, " E"]]):
             info, done = step
             tally = jax.vmap(count_step)(tally, info)
             episodes = jax.vmap(lambda tally: episode_metrics(tally, self.measures))(tally)
-            summary = count_episodes(summary, episodes, done)
             over = jax.vmap(lambda done, tally: jax.tree.map(lambda n, o: jnp.where(done, n, o), fresh, tally))
-            tally = over(done, tally)
-            return (tally, summary), None
+            return over(done, tally), episodes
 
         steps = experience.transitions
         inputs = (steps.info, steps.terminated | steps.truncated)
-        loop = (tally, no_episodes(self.measures))
         if self.num_steps == 1:
-            return one_step(loop, jax.tree.map(lambda leaf: leaf[0], inputs))[0]
-        return jax.lax.scan(one_step, loop, inputs)[0]
+            tally, episodes = one_step(tally, jax.tree.map(lambda leaf: leaf[0], inputs))
+            episodes = episodes[None]
+        else:
+            tally, episodes = jax.lax.scan(one_step, tally, inputs)
+        return tally, sum_up(episodes, inputs[1])
 
     def chunk_of_one(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
         """`num_updates` turns of the loop, for one seed."""
