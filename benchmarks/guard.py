@@ -1,10 +1,11 @@
-"""Has anything become slower? Ratios, and counts of instructions, against `benchmarks/baseline.json`.
+"""Has anything become slower? Ratios, and counts of programs, against `benchmarks/baseline.json`.
 
     python benchmarks/guard.py [--rounds 5] [--core 0] [--write]
-    python benchmarks/guard.py --short                  # instructions alone: a few seconds, for CI
+    python benchmarks/guard.py --short                  # counts alone: a few seconds, for CI
 
-Fails where a ratio to a peer has fallen by more than 15 %, or a compiled program has grown by as much. Absolute times
-are never compared. Instruction counts hold for one version of JAX: with another they are printed and not judged.
+Fails where a ratio to a peer has fallen by more than 15 %, or a compiled program has grown by as much: in instructions,
+or in messages between devices. Absolute times are never compared. Counts hold for one version of JAX: with another they
+are printed and not judged.
 --write makes what was measured the new baseline.
 """
 
@@ -23,15 +24,23 @@ BASELINE = Path(__file__).parent / "baseline.json"
 TOLERANCE = 0.15
 
 
-def instructions() -> dict[str, int]:
-    """Instructions in the compiled programs: the training loop of the paper's schedule, and a step of 32 copies."""
-    from gacrl.training.devices import prepare_jax
-
-    prepare_jax()
+def counted() -> dict[str, int]:
+    """Of compiled programs: instructions of the training loop of the paper's schedule and of a step of 32 copies, and
+    messages between two devices in an update of IPPO.
+    """
     import jax
     import jax.numpy as jnp
+    import numpy as np
+    from devices import collectives
+    from jax.sharding import Mesh
+
+    from gacrl.training.devices import prepare_jax
+
+    jax.config.update("jax_num_cpu_devices", 2)
+    prepare_jax()
 
     import gacrl
+    from gacrl.algorithms.shared import ENVS
     from gacrl.envs import copies
     from gacrl.envs.spread import Spread
     from gacrl.training import session
@@ -45,7 +54,13 @@ def instructions() -> dict[str, int]:
         "paper": trainer.chunk.lower(trainer.init((0,)), jnp.int32(1)),
         "environment": step.lower(state, jnp.zeros((32, 3), jnp.int32), jax.random.key(0)),
     }
-    return {name: program.compile().as_text().count(" = ") for name, program in programs.items()}
+    found = {
+        f"instructions: {name}": program.compile().as_text().count(" = ") for name, program in programs.items()
+    }
+    mesh = Mesh(np.array(jax.devices()).reshape(1, 2), ("seeds", ENVS))
+    shared = session.build(gacrl.preset("ippo"), mesh)
+    program = shared.chunk.lower(shared.init((0,)), jnp.int32(1)).compile()
+    return found | {"messages: ippo": round(collectives(program.as_text())[0])}
 
 
 def fallen(
@@ -72,13 +87,13 @@ def fallen(
 def grown(now: Mapping[str, int], before: Mapping[str, int]) -> list[str]:
     """Print the counts; those that grew too far."""
     for name, count in now.items():
-        print(f"{f'instructions: {name}':40} {count:<32} baseline {before.get(name, 'none')}")
-    return [f"instructions: {name}" for name, n in now.items() if n > (1 + TOLERANCE) * before.get(name, n)]
+        print(f"{name:40} {count:<32} baseline {before.get(name, 'none')}")
+    return [name for name, n in now.items() if n > (1 + TOLERANCE) * before.get(name, n)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--short", action="store_true", help="count instructions, measure nothing")
+    parser.add_argument("--short", action="store_true", help="count, measure nothing")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each side, per size")
     parser.add_argument("--core", type=int, default=0, help="the core that all sides are pinned to")
     parser.add_argument("--write", action="store_true", help="make what was measured the baseline")
@@ -86,9 +101,9 @@ def main() -> None:
     import jax
 
     baseline: dict[str, Any] = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.exists() else {}
-    counts = instructions()
+    counts = counted()
     same_version = baseline.get("jax") == jax.__version__
-    bad = grown(counts, baseline.get("instructions", {}) if same_version else {})
+    bad = grown(counts, baseline.get("counts", {}) if same_version else {})
     if not same_version:
         print(f"the baseline was counted with jax {baseline.get('jax', '(none)')}, this is {jax.__version__}")
     measured = {}
@@ -100,7 +115,7 @@ def main() -> None:
     if asked.write and missing:
         sys.exit(f"{BASELINE.name} stays as it was: {'; '.join(missing)}")
     if asked.write:
-        baseline |= {"jax": jax.__version__, "instructions": counts, **measured}
+        baseline |= {"jax": jax.__version__, "counts": counts, **measured}
         BASELINE.write_text(json.dumps(baseline, indent=2) + "\n", encoding="utf-8")
     elif bad:
         sys.exit(f"slower than {BASELINE.name} by more than {TOLERANCE:.0%}, or missing: {'; '.join(bad)}")

@@ -33,12 +33,13 @@ def test_a_ratio_that_fell_by_more_than_the_tolerance_is_named(guard, capsys):
 
 
 def test_a_program_that_grew_by_more_than_the_tolerance_is_named(guard):
-    before = {"paper": 1000, "environment": 1000}
-    assert guard.grown({"paper": 1160, "environment": 1140, "new": 5}, before) == ["instructions: paper"]
+    before = {"instructions: paper": 1000, "messages: ippo": 1000}
+    now = {"instructions: paper": 1160, "messages: ippo": 1140, "new": 5}
+    assert guard.grown(now, before) == ["instructions: paper"]
 
 
 def test_the_committed_baseline_is_what_the_guard_reads(guard):
     baseline = guard.json.loads(guard.BASELINE.read_text(encoding="utf-8"))
-    assert set(baseline) == {"jax", "instructions", "environment"}
+    assert set(baseline) == {"jax", "counts", "environment"}
     assert set(baseline["environment"]) == {"jaxmarl", "vmas"}
     assert all(set(sizes) == {"1", "32", "1024", "16384"} for sizes in baseline["environment"].values())

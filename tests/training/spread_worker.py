@@ -56,22 +56,6 @@ def configs(seeds: int) -> dict[str, RunConfig]:
     }
 
 
-def on_mesh(config: RunConfig, devices: np.ndarray) -> Trainer:
-    """A trainer on devices [seeds, envs]."""
-    built, mesh = session.build(config), Mesh(devices, ("seeds", ENVS))
-    num_envs, num_steps = config.training.num_envs, config.training.num_steps
-    return Trainer(
-        built.algorithm,
-        built.env,
-        built.curriculum,
-        num_envs,
-        num_steps,
-        config.num_seeds,
-        mesh=mesh,
-        for_speed=built.for_speed,
-    )
-
-
 def after_ten_updates(trainer: Trainer, config: RunConfig) -> dict[str, np.ndarray]:
     """Every number of the training state."""
     state, _ = jax.block_until_ready(trainer.chunk(trainer.init(config.seeds), UPDATES))
@@ -92,9 +76,10 @@ def main(names: str, out: str, devices: str, where: str = "", count: str = "1", 
     with distributed.joined(place, "", 120.0, Watcher()):
         for name in names.split(","):
             config = configs(seeds)[name]
-            trainer = session.build(config)
+            mesh = None
             if name == "ippo" and place.count == 1:  # of itself, one process does not spread environments on a CPU
-                trainer = on_mesh(config, np.asarray(jax.devices()).reshape(config.num_seeds, -1))
+                mesh = Mesh(np.asarray(jax.devices()).reshape(config.num_seeds, -1), ("seeds", ENVS))
+            trainer = session.build(config, mesh)
             found = after_ten_updates(trainer, config)
             if leads():
                 np.savez(f"{out}/{name}.npz", **found)

@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import spread_worker
+from jax.sharding import Mesh
 
+from gacrl.algorithms.shared import ENVS
 from gacrl.cli import main
 from gacrl.config import preset
 from gacrl.errors import UserError
@@ -76,8 +78,8 @@ def job(quick_start: dict[str, str]) -> Iterator[Job]:
 def alone(name: str, seeds: int) -> dict[str, np.ndarray]:
     """Ten updates on one device of this process."""
     config = spread_worker.configs(seeds)[name]
-    device = np.asarray(jax.local_devices()[:1]).reshape(1, 1)
-    return spread_worker.after_ten_updates(spread_worker.on_mesh(config, device), config)
+    device = Mesh(np.asarray(jax.local_devices()[:1]).reshape(1, 1), ("seeds", ENVS))
+    return spread_worker.after_ten_updates(session.build(config, device), config)
 
 
 def assert_same(file: Path, expected: dict[str, np.ndarray], seeds: int) -> None:

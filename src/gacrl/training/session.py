@@ -74,8 +74,8 @@ class Watcher:
     stop: Callable[[], bool] = lambda: False
 
 
-def build(config: RunConfig) -> Trainer:
-    """The compiled functions that train this configuration."""
+def build(config: RunConfig, devices: Mesh | None = None) -> Trainer:
+    """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`."""
     env = envs.make(config.env)
     if config.env.reward == "potential" and isinstance(config.algorithm, LearningConfig):
         env = replace(env, initial_params=env.initial_params._replace(potential_discount=config.algorithm.gamma))
@@ -89,7 +89,7 @@ def build(config: RunConfig) -> Trainer:
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,
         evaluation_env=evaluation_env(config),
-        mesh=mesh(config),
+        mesh=mesh(config) if devices is None else devices,
         # GACRL's program is as quick when it is quickly compiled, others' 3 to 10 % slower (docs/design.md).
         for_speed=not isinstance(config.algorithm, GacrlConfig),
     )
