@@ -1,6 +1,6 @@
 """How far training is from the arithmetic limit of the machine: counted products against measured ones.
 
-    python benchmarks/arithmetic.py [--preset gacrl …] [--core 0] [--json]
+    python benchmarks/arithmetic.py [--preset gacrl …] [--shapes shipped] [--num-envs N] [--core 0] [--json]
 
 For each preset: the matrix products of one update and the acting before it, counted from the program's jaxpr; the time
 that an update takes; and two limits. `large`: their FLOPs at the speed of a 512 × 512 product. `own`: each of them
@@ -14,23 +14,23 @@ from dataclasses import replace
 from typing import Any
 
 import peers
+import training
 
 PRESETS = ("gacrl", "qmix", "mappo", "ippo", "paper")
 SECONDS = 2.0
 """Of a measurement, about."""
 
 
-def measure(preset: str, num_envs: int | None) -> dict[str, float]:
+def measure(preset: str, shapes: str, num_envs: int | None) -> dict[str, float]:
     """Milliseconds of an update, its MFLOP, and the milliseconds of the two limits."""
     import jax
     import jax.numpy as jnp
     from products import Product, alone, products, total
     from updates import timed
 
-    from gacrl import config
     from gacrl.training import session
 
-    run = config.preset(preset)
+    run = training.settings(preset, shapes)
     if num_envs is not None:
         run = replace(run, training=replace(run.training, num_envs=num_envs))
     trainer = session.build(run)
@@ -51,6 +51,12 @@ def measure(preset: str, num_envs: int | None) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", action="append", help="several times for several; by default one of each kind")
+    parser.add_argument(
+        "--shapes",
+        choices=("shipped", "jaxmarl", "benchmarl"),
+        default="shipped",
+        help="a peer's networks, batches and epochs, as in training.py",
+    )
     parser.add_argument("--num-envs", type=int, help="instead of the preset's")
     parser.add_argument("--core", type=int, default=0)
     parser.add_argument("--json", action="store_true")
@@ -65,7 +71,7 @@ def main() -> None:
     print("| preset | steps/s | ms an update | MFLOP | at a large product's speed | each at its own |")
     print("| --- | --- | --- | --- | --- | --- |")
     for preset in asked.preset or PRESETS:
-        seen = table[preset] = measure(preset, asked.num_envs)
+        seen = table[preset] = measure(preset, asked.shapes, asked.num_envs)
         print(
             f"| {preset} | {seen['steps_per_second']:,.0f} | {seen['milliseconds']:.3g} | {seen['megaflop']:.3g} | "
             f"{seen['large'] / seen['milliseconds']:.0%} | {seen['own'] / seen['milliseconds']:.0%} |",

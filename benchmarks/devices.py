@@ -2,13 +2,13 @@
 
     python benchmarks/devices.py [--preset ippo] [--rounds 3] [--json]
 
-An update of E environments by two processes of one thread each, joined over loopback as `--distributed` joins
-them, takes the time of E/2 environments by one, and what the two tell each other:
+Two processes of one thread each, joined over loopback as `--distributed` joins them, have half of an update's
+environments each, and tell each other what they found:
 
-    seconds = (E/2 alone) + a · messages + b · GB
+    seconds = c · (an update of half as many, alone) + a · messages
 
-Messages are the collective operations of an update, GB what they bring together, both counted from the compiled
-program. a and b are fitted to the fewest and the most environments, and checked on those between. Wall time, the
+Messages are the arrays that collective operations bring together (gloo sends each by itself), counted from the compiled
+program. c and a are fitted to every second number of environments, and checked on the others. Wall time, the
 median of the rounds, in which all take turns; the machine should have nothing else to do.
 """
 
@@ -24,50 +24,47 @@ import time
 from dataclasses import replace
 from typing import Any
 
-ENVS = (32, 64, 128, 256)
+import numpy as np
+
+ENVS = (32, 64, 128, 256, 512)
 SECONDS = 2.0
 """Of a measurement, about."""
 BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4}
 
 
-def collectives(hlo: str) -> tuple[float, float]:
-    """Collective operations in one run of a compiled program, and the gigabytes of their results.
+def collectives(hlo: str) -> tuple[int, float]:
+    """Arrays that the collective operations of an update bring together, and their gigabytes.
 
-    A loop whose length is data (over the updates) counts once; what stands outside of it is not of an update.
+    hlo: a compiled chunk of training. Its loop over the updates is the one whose length is data; it is counted once.
     """
-    bodies: dict[str, list[str]] = {}
-    inside: list[str] = []
+    computations: dict[str, list[str]] = {}
+    lines: list[str] = []
     for line in hlo.splitlines():
         if opened := re.match(r"^(?:ENTRY )?%?([\w.\-]+) .*\{$", line):
-            inside = bodies.setdefault(opened[1], [])
-        else:
-            inside.append(line)
+            lines = computations.setdefault(opened[1], [])
+        lines.append(line)
 
-    def count(name: str) -> tuple[float, float]:
-        messages = size = 0.0
-        for line in bodies[name]:
-            found = re.search(
-                r" = (.*?) (?:all-reduce|all-gather|all-to-all|collective-permute)(?:-start)?\(", line
-            )
-            if found:
-                messages += 1
-                for kind, dims in re.findall(r"(\w+)\[([\d,]*)\]", found[1]):
-                    size += BYTES[kind] * math.prod(int(dim) for dim in dims.split(",") if dim) / 1e9
-            if loop := re.search(r" while\(.*body=%?([\w.\-]+)", line):
-                turns = re.search(r'known_trip_count":\{"n":"(\d+)"', line)
-                inner = count(loop[1])
-                messages, size = (
-                    a + (int(turns[1]) if turns else 1) * b for a, b in zip((messages, size), inner, strict=True)
-                )
-        return messages, size
+    def loop_in(line: str) -> tuple[str, int | None] | None:
+        """Its body, and how often it runs where that is known."""
+        body = re.search(r" while\(.*body=%?([\w.\-]+)", line)
+        turns = re.search(r'known_trip_count":\{"n":"(\d+)"', line)
+        return (body[1], int(turns[1]) if turns else None) if body else None
 
-    loops = [
-        re.search(r" while\(.*body=%?([\w.\-]+)", line)
-        for line in hlo.splitlines()
-        if "known_trip_count" not in line
-    ]
-    outermost = [loop[1] for loop in loops if loop]
-    return max(map(count, outermost))
+    def count(computation: str) -> np.ndarray:
+        found = np.zeros(2)
+        for line in computations[computation]:
+            if told := re.search(
+                r" = (.*?) (?:all-(?:reduce|gather|to-all)|collective-permute)(?:-start)?\(", line
+            ):
+                for kind, dims in re.findall(r"(\w+)\[([\d,]*)\]", told[1]):
+                    found += 1, BYTES[kind] * math.prod(int(dim) for dim in dims.split(",") if dim) / 1e9
+            if loop := loop_in(line):
+                found += (loop[1] or 1) * count(loop[0])
+        return found
+
+    loops = [loop for line in hlo.splitlines() if (loop := loop_in(line))]
+    messages, size = max((count(body) for body, turns in loops if turns is None), key=lambda found: found[0])
+    return int(messages), float(size)
 
 
 def work(preset: str, core: int, address: str, count: int) -> None:
@@ -152,8 +149,6 @@ def main() -> None:
         core, address, count = asked.work.split()
         work(asked.preset, int(core), address, int(count))
         return
-    import numpy as np
-
     one, two = Group(asked.preset, 1), Group(asked.preset, 2)
     alone: dict[int, list[float]] = {}
     shared: dict[int, list[list[float]]] = {}
@@ -168,24 +163,25 @@ def main() -> None:
     single = {envs: statistics.median(times) for envs, times in alone.items()}
     double = {envs: statistics.median(answer[0] for answer in answers) for envs, answers in shared.items()}
     told = {envs: answers[0][1:] for envs, answers in shared.items()}
-    ends = [ENVS[0], ENVS[-1]]
-    extra = [double[envs] - single[envs // 2] for envs in ends]
-    a, b = np.linalg.solve([told[envs] for envs in ends], extra)
-    print(f"seconds = (half alone) + {a:.3g} · messages + {b:.3g} · GB")
+    fitted = ENVS[::2]
+    terms = np.array([[single[envs // 2], told[envs][0]] for envs in fitted])
+    measured = np.array([double[envs] for envs in fitted])
+    c, a = np.linalg.lstsq(terms / measured[:, None], np.ones(len(fitted)))[0]
+    print(f"seconds = {c:.3g} · (half alone) + {a:.3g} · messages")
     print(
         "| environments | messages | MB | ms alone | half alone | by two | by the model | error | times as fast |"
     )
     print("| --- " * 9 + "|")
     for envs in ENVS:
         messages, size = told[envs]
-        model = single[envs // 2] + a * messages + b * size
+        model = c * single[envs // 2] + a * messages
         print(
-            f"| {envs}{'' if envs in ends else ', held out'} | {messages:.0f} | {1e3 * size:.3g} | "
+            f"| {envs}{'' if envs in fitted else ', held out'} | {messages:.0f} | {1e3 * size:.3g} | "
             f"{1e3 * single[envs]:.3g} | {1e3 * single[envs // 2]:.3g} | {1e3 * double[envs]:.3g} | "
             f"{1e3 * model:.3g} | {model / double[envs] - 1:+.0%} | {single[envs] / double[envs]:.2f} |"
         )
     if asked.json:
-        print(json.dumps({"a": a, "b": b, "alone": alone, "shared": shared}))
+        print(json.dumps({"c": c, "a": a, "alone": alone, "shared": shared}))
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def counted() -> dict[str, int]:
     mesh = Mesh(np.array(jax.devices()).reshape(1, 2), ("seeds", ENVS))
     shared = session.build(gacrl.preset("ippo"), mesh)
     program = shared.chunk.lower(shared.init((0,)), jnp.int32(1)).compile()
-    return found | {"messages: ippo": round(collectives(program.as_text())[0])}
+    return found | {"messages: ippo": collectives(program.as_text() or "")[0]}
 
 
 def fallen(

@@ -40,16 +40,7 @@ def configs(seeds: int) -> dict[str, RunConfig]:
         ),
         "gacrl": replace(
             gacrl,
-            # It learns in nine of the ten updates, in steps of 1e-3: with 3e-3 and twice as many, Adam makes 2.6e-5 of
-            # the rounding in one of 4,096 numbers.
-            algorithm=replace(
-                gacrl.algorithm,
-                replay_capacity=200,
-                learning_starts=20,
-                batch_size=8,
-                updates=1,
-                learning_rate=1e-3,
-            ),
+            algorithm=replace(gacrl.algorithm, replay_capacity=200, learning_starts=20, batch_size=8, updates=2),
             training=TrainingConfig(env_steps=200, num_envs=4, num_steps=5),
             num_seeds=seeds,
         ),
