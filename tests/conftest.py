@@ -3,7 +3,7 @@
 import contextlib
 import io
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,3 +120,22 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
         with contextlib.redirect_stdout(said):
             assert main(["train", *words, "--out", str(folder), "--json"]) == 0
     return TinyRun(folder, words, said.getvalue())
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Runs a command: its exit code, and what it printed as errors."""
+    from gacrl.cli import main
+
+    def run(*words: object) -> tuple[int, str]:
+        capsys.readouterr()
+        code = main([str(word) for word in words])
+        return code, capsys.readouterr().err
+
+    return run
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file of a run but its lock."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}

@@ -1,4 +1,4 @@
-"""What a run survives: kills while it writes, full and read-only disks, damage, a clock that jumps back, divergence."""
+"""What a run survives: kills while it writes, full and read-only disks, damage, a clock that jumps back."""
 
 import contextlib
 import functools
@@ -16,28 +16,21 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import TinyRun
+from conftest import TinyRun, content
 
-from gacrl import config as configuration
 from gacrl import play
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.cli import main
-from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.config import RunConfig
 from gacrl.errors import UserError
 from gacrl.experiments import paper_tables
 from gacrl.training import checkpoint, session
-from gacrl.training.divergence import Diverged, not_finite
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
-from gacrl.training.trainer import Trainer
 from gacrl.training.writer import Writer
-from gacrl.types import Decision
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -70,27 +63,10 @@ def copy(tiny_run: TinyRun, tmp_path: Path) -> Path:
     return Path(shutil.copytree(tiny_run.folder, tmp_path / "copy"))
 
 
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
-    """Runs a command: its exit code, and what it printed as errors."""
-
-    def run(*words: object) -> tuple[int, str]:
-        capsys.readouterr()
-        code = main([str(word) for word in words])
-        return code, capsys.readouterr().err
-
-    return run
-
-
 def rows(folder: Path) -> list[dict[str, Any]]:
     """Every line of the metrics, without the times that no two runs share."""
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     return [{name: value for name, value in json.loads(line).items() if name not in TIMES} for line in lines]
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def assert_same_end(folder: Path, other: Path) -> None:
@@ -381,6 +357,17 @@ def test_evaluations_that_are_gone_are_told(copy: Path, said: Callable[..., tupl
     )
 
 
+def test_a_watcher_is_told_of_damage(copy: Path):
+    """Also from Python, where nothing is printed."""
+    (copy / "checkpoints/step-000000000450/manifest.json").write_text("[" * 100_000)
+    told: list[str] = []
+    session.resume(copy, watcher=Watcher(warn=told.append))
+    assert len(told) == 1
+    assert "is damaged (maximum recursion depth exceeded" in told[0]
+    with pytest.raises(UserError, match="is missing"):
+        checkpoint.newest(copy / "nowhere")
+
+
 # The network.
 
 
@@ -430,136 +417,3 @@ def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path):
         jax.tree.leaves(opened.learners.network), jax.tree.leaves(learners.network), strict=True
     ):
         np.testing.assert_array_equal(here[0], np.asarray(there)[1])
-
-
-# Divergence.
-
-
-class Weights(NamedTuple):
-    network: Any
-    updates: Any
-
-
-def breaking(at: int, loss: float) -> Algorithm:
-    """Agents that stand still, and whose weights are broken by one update; the loss is finite up to then."""
-
-    def policy(learner: Weights, explore: bool) -> Any:
-        return lambda memory, observation, key, channel: (Decision(jnp.zeros(3, jnp.int32)), memory)
-
-    def init(key: Any, hyper: Any) -> Weights:
-        return Weights({"layer": jnp.ones((2, 3))}, jnp.zeros((), jnp.int32))
-
-    def update(learner: Weights, rollout: Any, key: Any) -> tuple[Weights, Any]:
-        updates = learner.updates + 1
-        layer = learner.network["layer"].at[1, 2].add(jnp.where(updates >= at, jnp.inf, 0.5))
-        return Weights({"layer": layer}, updates), {"loss": jnp.where(updates >= at, loss, updates * 1.0)}
-
-    return Algorithm(init, lambda num_agents: (), policy, update, hyper=())
-
-
-SHORT = RunConfig(
-    env=replace(configuration.preset("paper").env, max_cycles=4),
-    training=TrainingConfig(env_steps=60, num_envs=2, num_steps=3),
-    evaluation=EvaluationConfig(interval=18, num_episodes=2, final_episodes=2),
-    seed=7,
-)
-"""Ten updates, three to a chunk."""
-
-
-def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """The loss stays finite: it is a parameter, of the fifth update, that is not."""
-    folder = tmp_path / "run"
-    monkeypatch.setattr(session.algorithms, "make", lambda *_: breaking(at=5, loss=2.0))
-    monkeypatch.setattr(session, "build", functools.cache(BUILD))
-    monkeypatch.setattr(Trainer, "evaluate", lambda *_: {"return_agent_mean": np.zeros((1, 2))})
-    with pytest.raises(Diverged) as stopped:
-        session.start(SHORT, folder)
-    assert str(stopped.value) == (
-        "seed 7 diverged between environment steps 18 and 36: network['layer'] is inf in 1 of 6 places; try a smaller "
-        f"learning rate, or see the first bad update with `gacrl resume {folder} --diagnose`, which begins at the last "
-        "good checkpoint, of environment step 18"
-    )
-    assert [row["env_steps"] for row in rows(folder)] == [18]
-    assert [path.name for path in folder.glob("checkpoints/step-*")] == ["step-000000000018"]
-
-    before = content(folder)
-    assert main(["resume", str(folder), "--diagnose", "--json"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert json.loads(lines[-1]) == {
-        "begun_at": 18,
-        "ended_at": 30,
-        "bad": {
-            "seed": 7,
-            "update": 5,
-            "env_steps": 30,
-            "metrics": {"loss": [4.0, 2.0]},
-            "broken": {"network['layer']": "inf in 1 of 6 places"},
-        },
-    }
-    assert "seed 7: update 5, up to environment step 30, is the first bad one" in lines
-    assert content(folder) == before, "nothing is written"
-
-
-def test_what_is_not_finite_is_named():
-    learners = {"w": jnp.array([[1.0, 2.0], [jnp.nan, -jnp.inf]]), "n": jnp.array([[1], [2]])}
-    found = list(not_finite((3, 4), [{"loss": 1.0}, {"loss": float("inf")}], learners))
-    assert found == [(4, "loss", "inf"), (4, "['w']", "nan in 2 of 2 places")]
-    assert list(not_finite((3,), [{"loss": 1.0}], {"w": learners["w"]})) == [], (
-        "a repeated member is not looked at"
-    )
-
-
-# Memory.
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--algorithm.replay-capacity 10000000 --training.num-envs 100000 --num-seeds 100",
-        "--preset mappo --training.num-steps 1000000 --training.num-envs 1000",
-        "--preset paper --algorithm.batch-size 1000000 --env.num-agents 3000",
-        "--preset ippo --algorithm.network.width 65536 --algorithm.network.depth 9",
-        "--preset mappo --env.num-agents 10000",
-        "--preset qmix --evaluation.final-episodes 100000 --env.num-agents 500",
-    ],
-)
-def test_what_cannot_fit_is_refused_with_the_number(
-    words: str, tmp_path: Path, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(session, "build", BUILD)
-    monkeypatch.setattr(session.memory, "memory_of", lambda device: 16 * 2**30)
-    out = tmp_path / "run"
-    before = int(Path("/proc/self/statm").read_text().split()[1])
-    code, sentence = said("train", *words.split(), "--out", out)
-    assert code == 2
-    assert sentence.startswith("gacrl: this run needs at least ")
-    needed, unit = sentence.split("at least ")[1].split(" of memory")[0].split(" ")
-    assert float(needed.replace(",", "")) > 16 or unit != "GiB"
-    assert "and cpu:0 has 16.0 GiB" in sentence
-    assert not out.exists()
-    grown = (int(Path("/proc/self/statm").read_text().split()[1]) - before) * resource.getpagesize()
-    assert grown < 2**30, "nothing large was allocated to find out"
-
-
-def test_the_plan_of_a_run_counts_its_replay():
-    config = configuration.preset("gacrl")
-    trainer = BUILD(config)
-    planned = session.plan(trainer, config)
-    member = jax.eval_shape(lambda: trainer.init_stacked((0,)))
-    state = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(member))
-    assert planned.bytes_per_seed == state
-    assert planned.bytes_per_seed > 150_000 * 4 * 100
-    assert 2 * state < planned.bytes_needed < 2.5 * state
-
-
-def test_a_watcher_is_told_of_damage(copy: Path):
-    """Also from Python, where nothing is printed."""
-    (copy / "checkpoints/step-000000000450/manifest.json").write_text("[" * 100_000)
-    told: list[str] = []
-    session.resume(copy, watcher=Watcher(warn=told.append))
-    assert len(told) == 1
-    assert "is damaged (maximum recursion depth exceeded" in told[0]
-    with pytest.raises(UserError, match="is missing"):
-        checkpoint.newest(copy / "nowhere")
