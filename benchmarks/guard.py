@@ -110,7 +110,11 @@ def main() -> None:
     if not asked.short:
         ratios = environment.compare(asked.rounds, asked.core)
         bad += fallen("environment", ratios, baseline.get("environment", {}))
-        measured = {"environment": peers.summary(ratios)["ratio"]}
+        medians = peers.summary(ratios)["ratio"]
+        rounded = {
+            peer: {size: float(f"{ratio:.3g}") for size, ratio in sizes.items()} for peer, sizes in medians.items()
+        }
+        measured = {"environment": rounded}
     missing = [label for label in bad if label.endswith("(not measured)")]
     if asked.write and missing:
         sys.exit(f"{BASELINE.name} stays as it was: {'; '.join(missing)}")
