@@ -252,7 +252,8 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         learning_rate = progress_between(hyper.learning_rate, hyper.learning_rate_end, fraction)
         ent_coef = progress_between(hyper.ent_coef, hyper.ent_coef_end, fraction)
 
-        def slope(whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
+        def gradients_on(whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
+            """Of these rows' part of the loss; count: the real agents of the whole minibatch."""
             network, sample, memory, hyper, ent_coef, count = whole
             part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
             remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
@@ -262,7 +263,7 @@ def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: Vi
         def gradient_step(loop: tuple[Network, Any], step: tuple[Int[Array, " rows"], Int[Array, ""]]):
             (network, optimizer), (rows, count) = loop, step
             whole = (network, sample, memory, hyper, ent_coef, count)
-            gradients, metrics = sum_over_devices(slope, whole, rows)
+            gradients, metrics = sum_over_devices(gradients_on, whole, rows)
             directions, optimizer = adam.update(gradients, optimizer)
             network = jax.tree.map(lambda w, d: w - learning_rate * d, network, directions)
             return (network, optimizer), metrics
