@@ -171,9 +171,9 @@ def compare(
     """
     if not runs:
         raise UserError("name at least one run folder: `gacrl compare RUN RUN`")
-    if margin is not None and len(metrics) != 1:
-        raise UserError("a margin is in the units of a metric: name one with --metric")
     if margin is not None:
+        if len(metrics) != 1:
+            raise UserError("a margin is in the units of a metric: name one with --metric")
         statistics.require_margin(margin)
     loaded = [load(path, warn) for path in runs]
     require_same_task(loaded)
