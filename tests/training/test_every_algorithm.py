@@ -86,15 +86,15 @@ def test_2k_steps_are_k_steps_and_k_more(name: str, tmp_path: Path):
 @pytest.mark.soak
 @pytest.mark.parametrize("name", [param.values[0] for param in ALL])
 def test_members_are_their_seeds_alone(name: str):
-    """Within 1e-5 over ten updates, which is what `--num-seeds` promises, but for at most a hundred in a million numbers.
+    """Within 1e-5 over ten updates, which is what `--num-seeds` promises. (The paper's, and a probe: test_trainer.py.)
 
-    Where a gradient is next to nothing Adam divides the rounding by it. (The paper's, and a probe: test_trainer.py.)
+    But for a few of QMIX's numbers: where a gradient is next to nothing Adam divides the rounding by it.
     """
     several, single = (session.build(tiny(name, num_seeds=count)) for count in (2, 1))
     together, _ = several.chunk(several.init((3, 4)), 10)
     for member, seed in enumerate((3, 4)):
         alone, _ = single.chunk(single.init((seed,)), 10)
-        assert_nearly_same(named(together, member), named(alone, 0))
+        assert_nearly_same(named(together, member), named(alone, 0), strays=5 if name == "qmix" else 0)
 
 
 def named(stacked: Any, member: int) -> dict[str, np.ndarray]:
