@@ -67,7 +67,7 @@ def collectives(hlo: str) -> tuple[int, float]:
     return int(messages), float(size)
 
 
-def work(preset: str, core: int, address: str, count: int) -> None:
+def work(preset: str, process: int, address: str, count: int) -> None:
     """One process: for each line of numbers of environments, print the seconds of an update, messages and GB."""
     import jax
     import jax.numpy as jnp
@@ -78,7 +78,7 @@ def work(preset: str, core: int, address: str, count: int) -> None:
     from gacrl.training.session import Watcher
 
     prepare_jax()
-    place = distributed.find_place(address, count, core) if count > 1 else distributed.ALONE
+    place = distributed.find_place(address, count, process) if count > 1 else distributed.ALONE
     trainers: dict[int, Any] = {}
     with distributed.joined(place, "", 120.0, Watcher()):
         for line in sys.stdin:
@@ -91,7 +91,7 @@ def work(preset: str, core: int, address: str, count: int) -> None:
                 state = jax.block_until_ready(trainer.chunk(state, 1))[0]
                 trainers[envs] = trainer, state, collectives(text or "") if count > 1 else (0, 0)
             trainer, state, told = trainers[envs]
-            updates = max(2, round(SECONDS / (0.0008 * envs)))  # the same in both processes
+            updates = max(2, round(SECONDS / (0.0008 * envs)))  # not by the clock: the same in both processes
             begun = time.perf_counter()
             state = jax.block_until_ready(trainer.chunk(state, updates))[0]
             taken = (time.perf_counter() - begun) / updates
@@ -114,12 +114,12 @@ class Group:
             address = f"127.0.0.1:{free.getsockname()[1]}"
         self.processes = [
             subprocess.Popen(
-                [sys.executable, __file__, "--preset", preset, "--work", f"{core} {address} {count}"],
+                [sys.executable, __file__, "--preset", preset, "--work", f"{process} {address} {count}"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
             )
-            for core in range(count)
+            for process in range(count)
         ]
 
     def ask(self, envs: int) -> list[float]:
@@ -146,8 +146,8 @@ def main() -> None:
     parser.add_argument("--work", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.work:
-        core, address, count = asked.work.split()
-        work(asked.preset, int(core), address, int(count))
+        process, address, count = asked.work.split()
+        work(asked.preset, int(process), address, int(count))
         return
     one, two = Group(asked.preset, 1), Group(asked.preset, 2)
     alone: dict[int, list[float]] = {}
