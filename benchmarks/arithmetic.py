@@ -28,12 +28,12 @@ def measure(preset: str, shapes: str, num_envs: int | None) -> dict[str, float]:
     from products import Product, alone, products, total
     from updates import timed
 
-    from gacrl.training import session
+    from gacrl.training import build
 
     run = training.settings(preset, shapes)
     if num_envs is not None:
         run = replace(run, training=replace(run.training, num_envs=num_envs))
-    trainer = session.build(run)
+    trainer = build.make_trainer(run)
     taken, _ = timed(trainer, run, SECONDS)
     one = jax.eval_shape(trainer.init_member, jax.random.key(0), trainer.algorithm.hyper)
     found = products(jax.make_jaxpr(trainer.chunk_of_one)(one, jnp.int32(1)).jaxpr)

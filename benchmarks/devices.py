@@ -72,8 +72,8 @@ def work(preset: str, process: int, address: str, count: int) -> None:
     import jax
     import jax.numpy as jnp
 
-    from gacrl import config
-    from gacrl.training import distributed, session
+    from gacrl.config import presets
+    from gacrl.training import build, distributed
     from gacrl.training.devices import prepare_jax
     from gacrl.training.session import Watcher
 
@@ -84,8 +84,8 @@ def work(preset: str, process: int, address: str, count: int) -> None:
         for line in sys.stdin:
             envs = int(line)
             if envs not in trainers:
-                run = config.preset(preset)
-                trainer = session.build(replace(run, training=replace(run.training, num_envs=envs)))
+                run = presets.preset(preset)
+                trainer = build.make_trainer(replace(run, training=replace(run.training, num_envs=envs)))
                 state = trainer.init((0,))
                 text = trainer.chunk.lower(state, jnp.int32(1)).compile().as_text()
                 state = jax.block_until_ready(trainer.chunk(state, 1))[0]

@@ -64,7 +64,7 @@ def ours(num_envs: int, agents: int = 3, nearest: int | None = None) -> Callable
     import jax.numpy as jnp
 
     from gacrl.envs import copies
-    from gacrl.envs.spread import Spread
+    from gacrl.tasks.spread.environment import Spread
 
     env = Spread(agents, agents, num_agent_neighbors=nearest, num_landmark_neighbors=nearest)
     params = env.default_params()

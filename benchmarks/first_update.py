@@ -20,8 +20,8 @@ from gacrl.training.devices import prepare_jax
 prepare_jax(1)
 import jax
 from gacrl import config
-from gacrl.training import session
-trainer = session.build(config.preset(sys.argv[1]))
+from gacrl.training import build, session
+trainer = build.make_trainer(config.preset(sys.argv[1]))
 jax.block_until_ready(trainer.chunk(trainer.init((0,)), 1))
 """
 

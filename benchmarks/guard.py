@@ -34,6 +34,7 @@ def counted() -> dict[str, int]:
     from devices import collectives
     from jax.sharding import Mesh
 
+    from gacrl.training import build
     from gacrl.training.devices import prepare_jax
 
     jax.config.update("jax_num_cpu_devices", 2)
@@ -42,10 +43,9 @@ def counted() -> dict[str, int]:
     import gacrl
     from gacrl.algorithms.shared import ENVS
     from gacrl.envs import copies
-    from gacrl.envs.spread import Spread
-    from gacrl.training import session
+    from gacrl.tasks.spread.environment import Spread
 
-    trainer = session.build(gacrl.preset("paper"))
+    trainer = build.make_trainer(gacrl.preset("paper"))
     env = Spread()
     params = env.default_params()
     state = copies.reset(env, params, jax.random.split(jax.random.key(0), 32))[0]
@@ -58,7 +58,7 @@ def counted() -> dict[str, int]:
         f"instructions: {name}": program.compile().as_text().count(" = ") for name, program in programs.items()
     }
     mesh = Mesh(np.array(jax.devices()).reshape(1, 2), ("seeds", ENVS))
-    shared = session.build(gacrl.preset("ippo"), mesh)
+    shared = build.make_trainer(gacrl.preset("ippo"), mesh)
     program = shared.chunk.lower(shared.init((0,)), jnp.int32(1)).compile()
     return found | {"messages: ippo": collectives(program.as_text() or "")[0]}
 

@@ -44,6 +44,7 @@ def run_ours(core: int) -> dict[str, float]:
 def measure_ours(core: int) -> None:
     """The body of `run_ours`: the training program of `gacrl train --preset paper`, without evaluations."""
     os.sched_setaffinity(0, {core})
+    from gacrl.training import build
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
@@ -51,9 +52,8 @@ def measure_ours(core: int) -> None:
     import jax.numpy as jnp
 
     import gacrl
-    from gacrl.training import session
 
-    trainer = session.build(gacrl.preset("paper"))
+    trainer = build.make_trainer(gacrl.preset("paper"))
     state, _ = trainer.chunk(trainer.init((0,)), WARMUP)
     rates = []
     for _ in range(5):

@@ -52,9 +52,9 @@ class Cost(NamedTuple):
 
 def settings(num_agents: int = 3, num_envs: int = 25, batch_size: int = 64, **network: int) -> Any:
     """`gacrl-teams` without its limit on what is seen, of these sizes; entities always as dense."""
-    from gacrl import config
+    from gacrl.config import presets
 
-    run = config.preset("gacrl-teams")
+    run = presets.preset("gacrl-teams")
     seen = replace(run.algorithm.network, nearest_landmarks=None, nearest_agents=None, **network)
     return replace(
         run,
@@ -99,10 +99,11 @@ class Point:
         from products import products, total
         from updates import timed
 
-        from gacrl.training import memory, session
+        from gacrl.training import build
+        from gacrl.training import footprint as memory
 
         run = settings(**point)
-        trainer = session.build(run)
+        trainer = build.make_trainer(run)
         one = jax.eval_shape(trainer.init_member, jax.random.key(0), trainer.algorithm.hyper)
         jaxpr = jax.make_jaxpr(trainer.chunk_of_one)(one, jnp.int32(1)).jaxpr
         state = jax.eval_shape(trainer.init_stacked, (0,))

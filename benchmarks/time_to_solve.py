@@ -44,9 +44,9 @@ Reached = dict[float, tuple[float, int]]
 
 def solve(preset: str, seed: int, limit: float, cache: Path | None) -> tuple[Reached, float]:
     """Train until the highest level is reached, or the run or the time ends; and the time of the first evaluation."""
-    from gacrl import config
+    from gacrl.config import presets
 
-    settings = config.preset(preset)
+    settings = presets.preset(preset)
     interval = max(settings.training.env_steps // EVALUATIONS, settings.steps_per_update)
     environment = {**os.environ, **({} if cache is None else {"XDG_CACHE_HOME": str(cache)})}
     with tempfile.TemporaryDirectory() as room:

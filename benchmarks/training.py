@@ -33,9 +33,9 @@ ITERATIONS = 1
 
 def settings(preset: str, shapes: str) -> Any:
     """One of our presets as it is, or with a peer's networks, batches and epochs."""
-    from gacrl import config
+    from gacrl.config import presets
 
-    run = config.preset(preset)
+    run = presets.preset(preset)
     if shapes == "shipped":
         return run
     network = run.algorithm.network
@@ -55,15 +55,14 @@ def settings(preset: str, shapes: str) -> Any:
 @functools.cache
 def ours(algorithm: str, shapes: str) -> Callable[[], float]:
     """Steps a second of a chunk of training."""
+    from gacrl.training import build
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
     import jax
 
-    from gacrl.training import session
-
     run = settings(algorithm, shapes)
-    trainer = session.build(run)
+    trainer = build.make_trainer(run)
     warm = -(-getattr(run.algorithm, "learning_starts", 0) // run.steps_per_update) + 1
     state, _ = trainer.chunk(trainer.init((0,)), warm)
 

@@ -94,8 +94,8 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
 
     Tests that use it belong into the xdist group `runs`, so that it is trained once.
     """
-    from gacrl.cli import main
-    from gacrl.experiments import paper_tables
+    from gacrl.cli.main import main
+    from gacrl.experiments.paper import tables as paper_tables
 
     folder = tmp_path_factory.mktemp("tiny") / "run"
     words = [
@@ -125,7 +125,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
 @pytest.fixture
 def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
     """Runs a command: its exit code, and what it printed as errors."""
-    from gacrl.cli import main
+    from gacrl.cli.main import main
 
     def run(*words: object) -> tuple[int, str]:
         capsys.readouterr()

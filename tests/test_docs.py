@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from gacrl import arguments, cli
+from gacrl.cli import arguments
+from gacrl.cli import main as cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
@@ -59,13 +60,14 @@ def test_every_command_of_the_documents_and_of_help_is_understood(only_parsed: N
 
 def test_every_setting_that_the_documents_name_exists():
     """Whole names: what stands as `.rounds` after one of them is not followed."""
-    from gacrl import config
+    from gacrl.config import files as configuration
+    from gacrl.config import presets
 
     def names(data: dict[str, Any], where: str = "") -> set[str]:
         inner = [names(value, f"{where}{key}.") for key, value in data.items() if isinstance(value, dict)]
         return {where + key for key in data}.union(*inner)
 
-    known = set().union(*(names(config.to_dict(config.preset(name))) for name in config.PRESETS))
+    known = set().union(*(names(configuration.to_dict(presets.preset(name))) for name in presets.PRESETS))
     pattern = r"`((?:algorithm|env|training|evaluation|curriculum)\.[a-z_.]+?)(?: [^`]*)?`"
     for page in PAGES:
         unknown = set(re.findall(pattern, page.read_text(encoding="utf-8"))) - known

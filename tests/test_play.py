@@ -14,8 +14,10 @@ from mpe2 import simple_spread_v3
 
 import gacrl
 from gacrl import play
-from gacrl.config import RunConfig, fingerprint, preset
-from gacrl.training import checkpoint, session
+from gacrl.config.files import fingerprint
+from gacrl.config.presets import preset
+from gacrl.config.run import RunConfig
+from gacrl.training import build, checkpoint
 from gacrl.training.devices import one_seed, without_padding
 from gacrl.training.recorder import RunFolder
 from gacrl.types import Channel
@@ -28,7 +30,7 @@ N, V, SEEN = 3, 8, 18
 def untrained(config: RunConfig, path: Path) -> Path:
     """The folder of a run that has a checkpoint before its first step."""
     folder = RunFolder.create(path, config)
-    state = without_padding(session.build(config).init(config.seeds), config.num_seeds)
+    state = without_padding(build.make_trainer(config).init(config.seeds), config.num_seeds)
     tensors = checkpoint.serialise(checkpoint.arrays(state))
     checkpoint.save(folder.checkpoints, tensors, 0, fingerprint(config), {})
     return folder.path
@@ -59,7 +61,7 @@ def observations() -> np.ndarray:
 def test_it_acts_as_the_trained_policy_does(
     run: Path, config: RunConfig, policy: gacrl.LoadedPolicy, observations: np.ndarray
 ):
-    trainer = session.build(config)
+    trainer = build.make_trainer(config)
     learner = one_seed(trainer.init(config.seeds).learner, 0)
     act = jax.jit(trainer.algorithm.policy(learner, False))
     actions = []

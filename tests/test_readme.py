@@ -15,10 +15,12 @@ import pytest
 from conftest import SCRIPTED_ROW
 
 import gacrl
-from gacrl import cli, config
-from gacrl import presets as presets_module
-from gacrl.algorithm_config import GacrlConfig
-from gacrl.experiments import paper_tables, scoring
+from gacrl.cli import main as cli
+from gacrl.config import presets
+from gacrl.config.algorithms import GacrlConfig
+from gacrl.config.run import RunConfig
+from gacrl.experiments import scoring
+from gacrl.experiments.paper import tables as paper_tables
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -37,7 +39,7 @@ pytestmark = pytest.mark.xdist_group("readme")
 def room(tmp_path_factory, quick_start):
     """A folder to work in, in which the paper's schedule is short."""
 
-    def short(preset: config.RunConfig) -> config.RunConfig:
+    def short(preset: RunConfig) -> RunConfig:
         algorithm = preset.algorithm
         if isinstance(algorithm, GacrlConfig):
             algorithm = replace(algorithm, updates=1, batch_size=8, replay_capacity=500)
@@ -54,9 +56,9 @@ def room(tmp_path_factory, quick_start):
     def few(run: str, episodes: int, **asked: Any) -> dict[str, Any]:
         return score_run(run, episodes=min(episodes, 4), **asked)
 
-    presets = {name: ("short", short(config.preset(name))) for name in ("paper", "gacrl")}
+    shortened = {name: ("short", short(presets.preset(name))) for name in ("paper", "gacrl")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presets_module, "PRESETS", MappingProxyType({**config.PRESETS, **presets}))
+        patch.setattr(presets, "PRESETS", MappingProxyType({**presets.PRESETS, **shortened}))
         patch.setattr(scoring, "score_run", few)
         patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         patch.chdir(tmp_path_factory.mktemp("readme"))

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import gacrl
-from gacrl import config as configuration
-from gacrl.cli import main
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config import presets
 from gacrl.evaluation.episodes import Episode
 
 ROOT = Path(__file__).parent.parent
@@ -73,7 +74,7 @@ def test_a_poisoned_run_runs_nothing(
     for folder in (tmp_path, run):
         (folder / "task.py").write_text(f"open({str(proof)!r}, 'w')\nclass Task: pass\n")
     monkeypatch.chdir(tmp_path)
-    settings = configuration.to_dict(configuration.preset())
+    settings = configuration.to_dict(presets.preset())
     settings["env"]["name"] = "task.py:Task"
     (run / "config.json").write_text(json.dumps(settings))
     for command in ("resume", "evaluate", "render"):

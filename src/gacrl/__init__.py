@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gacrl.api import make_env, train
-    from gacrl.config import RunConfig, preset
+    from gacrl.config.presets import preset
+    from gacrl.config.run import RunConfig
     from gacrl.errors import ConfigError, UserError
     from gacrl.play import LoadedPolicy, load_policy
     from gacrl.training.session import Run
@@ -21,11 +22,11 @@ _HOMES = {
     "ConfigError": "gacrl.errors",
     "LoadedPolicy": "gacrl.play",
     "Run": "gacrl.training.session",
-    "RunConfig": "gacrl.config",
+    "RunConfig": "gacrl.config.run",
     "UserError": "gacrl.errors",
     "load_policy": "gacrl.play",
     "make_env": "gacrl.api",
-    "preset": "gacrl.config",
+    "preset": "gacrl.config.presets",
     "train": "gacrl.api",
 }
 

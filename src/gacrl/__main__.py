@@ -2,6 +2,6 @@
 
 import sys
 
-from gacrl.cli import main
+from gacrl.cli.main import main
 
 sys.exit(main())

@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from gacrl import config as configuration
-from gacrl import envs
-from gacrl.config import EnvConfig, RunConfig
-from gacrl.envs.spread import Spread
+from gacrl import tasks
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.run import EnvConfig, RunConfig
+from gacrl.tasks.spread.environment import Spread
 from gacrl.training import session
 from gacrl.training.devices import prepare_jax
 from gacrl.training.session import Run, Watcher
@@ -24,7 +25,7 @@ def train(
     config: the default preset where none is given. seed: replaces the configuration's. out: the run folder,
     by default the next free one under `runs/`. Raises UserError (ConfigError for settings) with one sentence.
     """
-    config = configuration.preset() if config is None else config
+    config = presets.preset() if config is None else config
     config = config if seed is None else replace(config, seed=seed)
     prepare_jax(config.num_seeds)
     return session.start(config, None if out is None else Path(out), watcher)
@@ -33,7 +34,7 @@ def train(
 def make_env(name: Literal["spread"] = "spread", **settings: Any) -> Spread:
     """A task in pure functions: `reset(key)`, `step(state, actions, key)`.
 
-    settings: the fields of `gacrl.config.EnvConfig`. Raises ConfigError for one there is not, or out of range.
+    settings: the fields of `gacrl.config.run.EnvConfig`. Raises ConfigError for one there is not, or out of range.
     """
-    base = replace(configuration.preset(), env=EnvConfig())
-    return envs.make(configuration.from_dict({"env": {"name": name, **settings}}, base).env)
+    base = replace(presets.preset(), env=EnvConfig())
+    return tasks.make(configuration.from_dict({"env": {"name": name, **settings}}, base).env)

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gacrl import config, envs
-from gacrl.algorithm_config import AlgorithmConfig, GacrlPaperConfig, PpoConfig, QmixConfig
-from gacrl.config import EnvConfig
-from gacrl.envs import scripted
+from gacrl import tasks
+from gacrl.adapters import mpe2
+from gacrl.config import presets
+from gacrl.config.algorithms import AlgorithmConfig, GacrlPaperConfig, PpoConfig, QmixConfig
+from gacrl.config.run import EnvConfig
 from gacrl.envs.probes import BEST_RETURN
-from gacrl.evaluation import mpe2
 from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.tasks.spread import scripted
 from gacrl.training.probing import probe_algorithm
 from gacrl.versions import versions
 
@@ -54,10 +55,10 @@ def examine() -> Iterator[Finding]:
     yield Finding("devices", True, f"{len(devices)} × {devices[0].device_kind} on {platform.machine()}")
     yield _same_world()
     seen: list[Trial] = []
-    for name in config.PRESETS:
+    for name in presets.PRESETS:
         if name.startswith("graph-"):  # learners of the others; what they see more shows only in space
             continue
-        asked = trial(config.preset(name).algorithm)
+        asked = trial(presets.preset(name).algorithm)
         if asked not in seen:  # presets may differ by their task alone
             yield from _learns(name, asked)
         seen.append(asked)
@@ -65,7 +66,7 @@ def examine() -> Iterator[Finding]:
 
 def _same_world() -> Finding:
     """The oracle's return in our environment and in the real MPE2, on each one's own starts."""
-    env = envs.make(EnvConfig())
+    env = tasks.make(EnvConfig())
     policy, memory = scripted.make("oracle", env)
     key, episodes = stream_key("monitor"), 64
     ours = jax.jit(lambda: evaluate(env, policy, memory, env.default_params(), key, episodes))()

@@ -11,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gacrl import config as configuration
-from gacrl import envs
-from gacrl.algorithm_config import AlgorithmConfig, GacrlPaperConfig, QLearningConfig
-from gacrl.config import CurriculumConfig, EnvConfig, RunConfig
-from gacrl.envs import scripted
-from gacrl.envs.spread import Spread
+from gacrl import tasks
+from gacrl.config import files as configuration
+from gacrl.config.algorithms import AlgorithmConfig, GacrlPaperConfig, QLearningConfig
+from gacrl.config.checks import unknown
+from gacrl.config.run import CurriculumConfig, EnvConfig, RunConfig
 from gacrl.errors import UserError
-from gacrl.training import checkpoint, keeper, session
+from gacrl.tasks.spread import scripted
+from gacrl.tasks.spread.environment import Spread
+from gacrl.training import build, checkpoint, keeper, session
 from gacrl.training.devices import one_seed, rows
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
@@ -40,7 +41,7 @@ class TrainedRun:
     @property
     def env(self) -> Spread:
         """The task to be played."""
-        return envs.make(self.config.env)
+        return tasks.make(self.config.env)
 
     def policy(self, member: int, explore: bool) -> Policy:
         """The policy of one seed."""
@@ -74,7 +75,7 @@ def open_run(
             f"{path} was trained with {config.env.num_agents} agents, and the paper's GACRL is built for their "
             "number (equation (10) puts all messages side by side): leave --num-agents out"
         )
-    trainer = session.build(changed)
+    trainer = build.make_trainer(changed)
     found, warnings = checkpoint.newest(folder.checkpoints, kind)
     for warning in warnings:
         warn(warning)
@@ -83,7 +84,7 @@ def open_run(
         if member >= config.num_seeds:
             raise UserError(f"{path} has the members 0 to {config.num_seeds - 1}: there is no @{member}")
         changed = replace(changed, seed=config.seed + member, num_seeds=1)
-        trainer = session.build(changed)
+        trainer = build.make_trainer(changed)
         learners = rows(learners, member, member + 1)
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
@@ -134,7 +135,7 @@ def _split(run: str) -> tuple[Path, int | None, str]:
     if colon and origin == "pretrained":
         shipped = pretrained()
         if name not in shipped:
-            raise UserError(configuration.unknown("pretrained policy", name, list(shipped)))
+            raise UserError(unknown("pretrained policy", name, list(shipped)))
         return shipped[name], None, kind
     folder, at, member = run.rpartition("@")
     if at and member.isdigit() and not Path(run).exists():
@@ -181,12 +182,12 @@ def load_policy(run: str | Path) -> LoadedPolicy:
     """The policy of a run: its folder, `FOLDER@k`, or `random` and `noop`.
 
     Raises UserError where there is no such run. The oracle and the local policy need the exact state, which
-    observations alone do not give: play them with `gacrl.envs.scripted`.
+    observations alone do not give: play them with `gacrl.tasks.spread.scripted`.
     """
     if str(run) in scripted.PLAYABLE:
         if str(run) not in ("random", "noop"):
-            raise UserError(f"{run} needs the exact state, not observations: use gacrl.envs.scripted")
-        env = envs.make(EnvConfig())
+            raise UserError(f"{run} needs the exact state, not observations: use gacrl.tasks.spread.scripted")
+        env = tasks.make(EnvConfig())
         actor = scripted.make(str(run), env)
         return LoadedPolicy(env, dict.fromkeys((True, False), actor.policy), actor.initial_memory)
     opened = open_run(run)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from conftest import drawn_learner
 
-from gacrl import config as configuration
-from gacrl.algorithm_config import LearningConfig, NetworkConfig
-from gacrl.algorithms import algorithm as algorithms
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.config import TrainingConfig
-from gacrl.envs.spread import Spread
+from gacrl.algorithms import build as algorithms
+from gacrl.algorithms.contract import Algorithm
+from gacrl.config import presets
+from gacrl.config.algorithms import LearningConfig, NetworkConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.errors import ConfigError
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -23,7 +23,7 @@ TRAINING = TrainingConfig(env_steps=100, num_envs=2, num_steps=4)
 
 
 def made(preset: str, env: Spread, symmetric: bool) -> Algorithm:
-    config = configuration.preset(preset).algorithm
+    config = presets.preset(preset).algorithm
     assert isinstance(config, LearningConfig)
     network = replace(config.network, width=8)
     return algorithms.make(replace(config, network=network, symmetric_play=symmetric), env, TRAINING)
@@ -74,8 +74,6 @@ def test_it_is_the_mean_over_eight_conversations():
 
 def test_networks_that_do_not_go_with_their_learner_are_refused():
     with pytest.raises(ConfigError, match="latent needs a learner that trains the code"):
-        replace(configuration.preset("mappo").algorithm, network=NetworkConfig(latent="vae"))
+        replace(presets.preset("mappo").algorithm, network=NetworkConfig(latent="vae"))
     with pytest.raises(ConfigError, match="symmetric_play needs a network without memory"):
-        replace(
-            configuration.preset("gacrl").algorithm, symmetric_play=True, network=NetworkConfig(recurrent=True)
-        )
+        replace(presets.preset("gacrl").algorithm, symmetric_play=True, network=NetworkConfig(recurrent=True))

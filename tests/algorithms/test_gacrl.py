@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from conftest import drawn
 
-from gacrl import config as configuration
-from gacrl.algorithm_config import NetworkConfig
-from gacrl.algorithms import algorithm as algorithms
+from gacrl.algorithms import build as algorithms
 from gacrl.algorithms import gacrl
 from gacrl.algorithms.actions import STRENGTHS, choices
 from gacrl.algorithms.exploration import EXPLORING, GREEDY, UNSETTLED, Follower, adaptive
 from gacrl.algorithms.q_learning import Network
-from gacrl.config import TrainingConfig
-from gacrl.envs.spread import Spread
+from gacrl.config import presets
+from gacrl.config.algorithms import NetworkConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import most_likely_symbol
+from gacrl.tasks.spread.environment import Spread
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
 from gacrl.types import Channel, Decision, Transition
@@ -31,7 +31,7 @@ TALKING = NetworkConfig(
     torso="graph", width=8, latent="vae", latent_size=3, communication="discrete", vocabulary=4
 )
 SMALL = replace(
-    configuration.preset("gacrl").algorithm,
+    presets.preset("gacrl").algorithm,
     network=TALKING,
     replay_capacity=60,
     learning_starts=10,

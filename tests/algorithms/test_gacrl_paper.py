@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gacrl import config as settings
-from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.algorithms import gacrl_paper, replay
-from gacrl.algorithms.exploration import Coverage
-from gacrl.config import CurriculumConfig
-from gacrl.envs.spread import Spread
+from gacrl.algorithms.gacrl_paper_exploration import Coverage
+from gacrl.config import presets
+from gacrl.config.algorithms import GacrlPaperConfig
+from gacrl.config.run import CurriculumConfig
 from gacrl.networks.layers import num_parameters
+from gacrl.tasks.spread.environment import Spread
 from gacrl.training import curriculum
 from gacrl.types import Channel, Rollout, Transition
 
@@ -249,7 +249,7 @@ def _layers(network):
 
 
 def test_preset_is_table_one():
-    preset = settings.preset("paper")
+    preset = presets.preset("paper")
     algorithm = preset.algorithm
     assert (algorithm.learning_rate, algorithm.learning_rate_end) == (0.0005, 0.0001)
     assert (algorithm.epsilon, algorithm.epsilon_end) == (0.3, 0.1)
@@ -618,7 +618,7 @@ def test_environments_side_by_side_share_one_coverage(monkeypatch):
 def test_curriculum_moves_once_an_episode():
     """Local ratio .5 → .1 and θ .5 → .2 over 1500 episodes; steps within an episode change nothing."""
     env = Spread(N, 3, max_cycles=75, reward="paper")
-    paper = settings.preset("paper")
+    paper = presets.preset("paper")
     advancing = curriculum.make(paper.curriculum)
     base = env.default_params()
 

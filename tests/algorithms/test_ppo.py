@@ -12,13 +12,13 @@ from conftest import drawn, drawn_learner
 from scipy import special, stats
 
 from gacrl import rollout
-from gacrl.algorithm_config import IppoConfig, MappoConfig, NetworkConfig
 from gacrl.algorithms import ippo, mappo, ppo
 from gacrl.algorithms.objectives import clipped_surrogate, follow_returns, huber, no_returns
 from gacrl.algorithms.shared import mean_real, share_reward
-from gacrl.config import TrainingConfig
+from gacrl.config.algorithms import IppoConfig, MappoConfig, NetworkConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Decision, Rollout, Transition
 
 pytestmark = pytest.mark.usefixtures("quick_start")

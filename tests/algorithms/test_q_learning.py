@@ -12,13 +12,13 @@ from conftest import drawn_learner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gacrl.algorithm_config import QmixConfig
 from gacrl.algorithms import exploration, q_learning, replay
 from gacrl.algorithms.q_learning import Network, Parts, epsilon_greedy
 from gacrl.algorithms.qmix import MIXERS
-from gacrl.config import TrainingConfig
-from gacrl.envs.spread import Spread
+from gacrl.config.algorithms import QmixConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Decision, Observation, Rollout, Transition
 
 pytestmark = pytest.mark.usefixtures("quick_start")

@@ -9,7 +9,7 @@ import pytest
 
 from gacrl.envs import copies
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread, SpreadParams
+from gacrl.tasks.spread.environment import Spread, SpreadParams
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 

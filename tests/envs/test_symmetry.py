@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gacrl.envs.spread import Spread, SpreadState
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
+from gacrl.tasks.spread.environment import Spread, SpreadState
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gacrl.envs.spread import Spread, unpack_state
 from gacrl.evaluation.episodes import Episode, record_many, written_whole
 from gacrl.evaluation.evaluate import evaluate
 from gacrl.networks.graph import proximity_adjacency
+from gacrl.tasks.spread.environment import Spread, unpack_state
 from gacrl.types import Channel, Decision
 
 KEY = jax.random.key(7)

@@ -1,6 +1,5 @@
 """Statistics over seeds, against numbers worked out by hand and those of rliable."""
 
-import json
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,12 +8,10 @@ import pytest
 from gacrl.errors import UserError
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import (
-    EvaluatedRun,
     detectable,
     difference,
     equivalent,
     estimate,
-    from_marl_eval,
     iqm,
     mean,
     median,
@@ -22,7 +19,6 @@ from gacrl.evaluation.statistics import (
     performance_profile,
     probability_of_improvement,
     sample_efficiency,
-    to_marl_eval,
 )
 
 # rliable is no dependency of these tests: version 1.2.0 brings eight packages (pandas, statsmodels, arch and
@@ -227,48 +223,3 @@ def test_equivalence_is_symmetric_and_holds_without_spread():
 def test_what_cannot_be_computed_is_said(call, sentence: str):
     with pytest.raises(UserError, match=sentence):
         call()
-
-
-RUN = EvaluatedRun(
-    environment="spread",
-    task="3_agents",
-    algorithm="vdn",
-    run="seed_0",
-    env_steps=[100, 200],
-    metrics={"return": [[-26.0, -24.0], [-20.0, -18.0]]},
-    absolute={"return": [-19.0]},
-)
-
-
-def test_marl_eval_out_and_in():
-    data = to_marl_eval([RUN])
-    assert data == {
-        "spread": {
-            "3_agents": {
-                "vdn": {
-                    "seed_0": {
-                        "step_0": {"step_count": 100, "return": [-26.0, -24.0]},
-                        "step_1": {"step_count": 200, "return": [-20.0, -18.0]},
-                        "absolute_metrics": {"return": [-19.0]},
-                    }
-                }
-            }
-        }
-    }
-    assert from_marl_eval(json.loads(json.dumps(data))) == [RUN]
-
-
-def test_marl_eval_steps_are_ordered_by_count():
-    run = {"step_10": {"step_count": 9, "x": [2]}, "step_9": {"step_count": 3, "elapsed_time": 1.5, "x": [1]}}
-    (found,) = from_marl_eval({"e": {"t": {"a": {"r": run}}}})
-    assert found.env_steps == [3, 9]
-    assert found.metrics == {"x": [[1.0], [2.0]]}
-    assert found.absolute == {}
-
-
-def test_marl_eval_refuses_what_it_is_not():
-    with pytest.raises(UserError, match="seed_0 of vdn on 3_agents is there twice"):
-        to_marl_eval([RUN, RUN])
-    for data in ({"e": 3}, {"e": {"t": {"a": {"r": {"step_0": {"x": [1]}}}}}}):
-        with pytest.raises(UserError, match="not marl-eval's raw data"):
-            from_marl_eval(data)

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gacrl import config as configuration
-from gacrl.algorithm_config import GacrlConfig
-from gacrl.cli import main
-from gacrl.config import RunConfig
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.algorithms import GacrlConfig
+from gacrl.config.run import RunConfig
 from gacrl.experiments import ablate
 from gacrl.experiments.ablate import FULL, METRICS, PARTS, SCORE, YOKED, plan
 from gacrl.experiments.study import DIVERGED, Planned
@@ -28,7 +29,7 @@ EPSILON = np.array([[1.0, 0.51, 0.265, 0.02], [1.0, 0.51, 0.265, 0.02]])
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Planned]:
-    config = configuration.preset("gacrl-112k")
+    config = presets.preset("gacrl-112k")
     return {run.name: run for run in plan(config, tmp_path_factory.mktemp("plan"), list(PARTS))}
 
 
@@ -141,9 +142,9 @@ def test_the_command_says_what_each_part_is_worth(
 def test_there_is_nothing_to_compare_with_where_the_whole_diverges(
     trained: list[RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    preset = configuration.preset("gacrl-112k")
+    preset = presets.preset("gacrl-112k")
     bare = replace(preset, env=replace(preset.env, reward="mpe2"))
-    monkeypatch.setattr(configuration, "preset", lambda name="gacrl": bare)
+    monkeypatch.setattr(presets, "preset", lambda name="gacrl": bare)
     assert main(["ablate", "--part", YOKED, "--out", str(tmp_path / "out")]) == 2
     assert "nothing to compare with: with all parts, seed 0 diverged" in capsys.readouterr().err
     assert len(trained) == 1

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gacrl import config as configuration
-from gacrl.algorithm_config import GacrlPaperConfig
-from gacrl.cli import main
-from gacrl.config import RunConfig
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.algorithms import GacrlPaperConfig
+from gacrl.config.run import RunConfig
 from gacrl.experiments import search, study
 from gacrl.experiments.search import Searched, proposals
 from gacrl.experiments.study import Watch
@@ -90,7 +91,7 @@ def test_the_example_of_the_guide_is_a_search(tmp_path: Path):
     guide = Path(__file__).parents[2] / "docs/guides/cluster.md"
     (tmp_path / "guide.toml").write_text(guide.read_text(encoding="utf-8").split("```toml\n")[1].split("```")[0])
     spec = search.load(tmp_path / "guide.toml")
-    assert spec.config.training == replace(configuration.preset("ippo").training, num_envs=32, env_steps=500_000)
+    assert spec.config.training == replace(presets.preset("ippo").training, num_envs=32, env_steps=500_000)
     assert [one.kind for one in spec.searched] == ["log", "uniform", "integer", "choice"]
 
 

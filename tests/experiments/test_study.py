@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conftest import TinyRun
 
-from gacrl import config as configuration
-from gacrl.config import RunConfig
+from gacrl.config import presets
+from gacrl.config.run import RunConfig
 from gacrl.evaluation.metrics import EPISODE_METRICS
-from gacrl.experiments.evidence import read_series
+from gacrl.experiments.paper.evidence import read_series
 from gacrl.experiments.study import DIVERGED, Planned, Watch, train_missing
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("r
 
 
 def tiny(folder: Path, seed: int) -> Planned:
-    paper = configuration.preset("paper")
+    paper = presets.preset("paper")
     config = replace(
         paper,
         env=replace(paper.env, max_cycles=5),

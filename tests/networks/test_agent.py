@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from conftest import drawn
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread, SpreadParams
 from gacrl.networks.agent import AgentMemory, AgentNetwork, matched, unroll
 from gacrl.networks.layers import num_parameters
+from gacrl.tasks.spread.environment import Spread, SpreadParams
 from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")

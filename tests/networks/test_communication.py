@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from conftest import drawn
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread
 from gacrl.networks import communication
 from gacrl.networks.agent import AgentMemory, AgentNetwork, unroll
 from gacrl.networks.communication import Neighbourhood, discretise_regularise
 from gacrl.networks.graph import proximity_adjacency
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")

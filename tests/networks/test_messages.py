@@ -7,12 +7,7 @@ import pytest
 
 from gacrl.networks.encoder import kl_divergence, sample_latent
 from gacrl.networks.graph import neighbour_sum, proximity_adjacency
-from gacrl.networks.messages import (
-    gumbel_softmax,
-    mailbox,
-    most_likely_symbol,
-    transmit,
-)
+from gacrl.networks.messages import gumbel_softmax, mailbox, most_likely_symbol, transmit
 from gacrl.types import Channel
 
 V, N = 4, 3

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from conftest import drawn
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread, SpreadParams, SpreadState
 from gacrl.networks import torso as torsos
 from gacrl.networks.agent import AgentNetwork
+from gacrl.tasks.spread.environment import Spread, SpreadParams, SpreadState
 from gacrl.types import Observation
 
 pytestmark = pytest.mark.usefixtures("quick_start")

@@ -13,8 +13,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 from gacrl.algorithms.shared import ENVS
-from gacrl.config import RunConfig, TrainingConfig, preset
-from gacrl.training import distributed, session
+from gacrl.config.presets import preset
+from gacrl.config.run import RunConfig, TrainingConfig
+from gacrl.training import build, distributed
 from gacrl.training.devices import gathered, leads, without_padding
 from gacrl.training.session import Watcher
 from gacrl.training.trainer import Trainer
@@ -70,7 +71,7 @@ def main(names: str, out: str, devices: str, where: str = "", count: str = "1", 
             mesh = None
             if name == "ippo" and place.count == 1:  # of itself, one process does not spread environments on a CPU
                 mesh = Mesh(np.asarray(jax.devices()).reshape(config.num_seeds, -1), ("seeds", ENVS))
-            trainer = session.build(config, mesh)
+            trainer = build.make_trainer(config, mesh)
             found = after_ten_updates(trainer, config)
             if leads():
                 np.savez(f"{out}/{name}.npz", **found)

@@ -24,13 +24,15 @@ from conftest import TinyRun
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gacrl import config as configuration
-from gacrl.cli import main
-from gacrl.config import PRESETS, RunConfig
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config.presets import PRESETS
+from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError
 from gacrl.evaluation.metrics import EPISODE_METRICS
-from gacrl.experiments import paper_tables, scoring
-from gacrl.training import checkpoint, session
+from gacrl.experiments import scoring
+from gacrl.experiments.paper import tables as paper_tables
+from gacrl.training import build, checkpoint, session
 
 pytestmark = [
     pytest.mark.usefixtures("quick_start"),
@@ -41,7 +43,7 @@ pytestmark = [
 
 FEW = int(os.environ.get("GACRL_FUZZ", "25"))
 MANY = 25 * FEW
-BUILD = session.build
+BUILD = build.make_trainer
 COMMANDS = ("resume", "evaluate", "compare")
 
 
@@ -60,7 +62,7 @@ def traced_once() -> Iterator[None]:
         references = {
             name: dict.fromkeys(EPISODE_METRICS, float(k)) for k, name in enumerate(("random", "noop", "oracle"))
         }
-        patch.setattr(session, "build", functools.cache(BUILD))
+        patch.setattr(session, "make_trainer", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
         patch.setattr(session.episodes, "record_many", lambda *_: [])
@@ -345,7 +347,7 @@ def extreme(draw: st.DrawFn) -> RunConfig:
 
 def check_plan(config: RunConfig) -> None:
     with contextlib.suppress(UserError):
-        planned = session.plan(BUILD(config), config)
+        planned = build.plan(BUILD(config), config)
         assert planned.bytes_needed >= planned.bytes_per_seed > 0
 
 

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gacrl import config as configuration
-from gacrl.config import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig, TrainingConfig
-from gacrl.envs.spread import Spread
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.run import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.errors import ConfigError
 from gacrl.play import open_run
-from gacrl.training import checkpoint, curriculum, session
+from gacrl.tasks.spread.environment import Spread
+from gacrl.training import build, checkpoint, curriculum
 from gacrl.training.recorder import RunFolder
 from gacrl.types import Rollout
 
@@ -66,8 +67,8 @@ def test_arena_and_team_grow_to_the_configured_task():
 
 GROWING = RunConfig(
     algorithm=replace(
-        configuration.preset("gacrl").algorithm,
-        network=replace(configuration.preset("gacrl").algorithm.network, width=8, latent_size=2, rounds=1),
+        presets.preset("gacrl").algorithm,
+        network=replace(presets.preset("gacrl").algorithm.network, width=8, latent_size=2, rounds=1),
         augment=False,
         symmetric_play=False,
         replay_capacity=64,
@@ -83,7 +84,7 @@ GROWING = RunConfig(
 
 
 def test_a_team_grows_within_one_program():
-    trainer = session.build(GROWING)
+    trainer = build.make_trainer(GROWING)
     state = trainer.init((0,))
     start = state.carry.env_state
     assert np.abs(start.positions).max() <= 0.2, "the first episodes start in the arena's first size"
@@ -102,7 +103,7 @@ def test_a_team_grows_within_one_program():
 def test_a_team_that_grew_plays_with_fewer_than_it_began_with(tmp_path: Path):
     config = replace(GROWING, curriculum=CurriculumConfig(num_agents_start=3))
     folder = RunFolder.create(tmp_path / "run", config)
-    tensors = checkpoint.serialise(checkpoint.arrays(session.build(config).init((0,))))
+    tensors = checkpoint.serialise(checkpoint.arrays(build.make_trainer(config).init((0,))))
     checkpoint.save(folder.checkpoints, tensors, 0, configuration.fingerprint(config), {})
     assert open_run(folder.path, lambda env: replace(env, num_agents=2)).env.num_agents == 2
 
@@ -113,4 +114,4 @@ def test_what_cannot_grow_is_refused():
     with pytest.raises(ConfigError, match="num_agents_start must be at most env.num_agents, 3, not 4"):
         RunConfig(curriculum=CurriculumConfig(num_agents_start=4))
     with pytest.raises(ConfigError, match="gacrl_paper knows teams of one size only"):
-        replace(configuration.preset("paper"), curriculum=CurriculumConfig(num_agents_start=2))
+        replace(presets.preset("paper"), curriculum=CurriculumConfig(num_agents_start=2))

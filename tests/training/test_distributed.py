@@ -22,10 +22,10 @@ from conftest import assert_nearly_same
 from jax.sharding import Mesh
 
 from gacrl.algorithms.shared import ENVS
-from gacrl.cli import main
-from gacrl.config import preset
+from gacrl.cli.main import main
+from gacrl.config.presets import preset
 from gacrl.errors import UserError
-from gacrl.training import checkpoint, devices, session
+from gacrl.training import build, checkpoint, devices
 from gacrl.training.distributed import find_place
 from gacrl.training.peers import Place
 
@@ -80,7 +80,7 @@ def alone(name: str, seeds: int) -> dict[str, np.ndarray]:
     """Ten updates of each seed by itself, on one device of this process."""
     config = replace(spread_worker.configs(seeds)[name], num_seeds=1)
     device = Mesh(np.asarray(jax.local_devices()[:1]).reshape(1, 1), ("seeds", ENVS))
-    trainer, count = session.build(config, device), spread_worker.configs(seeds)[name].num_seeds
+    trainer, count = build.make_trainer(config, device), spread_worker.configs(seeds)[name].num_seeds
     each = [spread_worker.after_ten_updates(trainer, replace(config, seed=seed)) for seed in range(count)]
     return {path: np.concatenate([found[path] for found in each]) for path in each[0]}
 
@@ -229,14 +229,14 @@ def test_what_processes_cannot_share_is_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(jax, "local_devices", lambda process=0: [[first], [second]][process])
     gacrl = preset("gacrl")
     with pytest.raises(UserError, match="2 processes cannot share 1 seeds .* give --num-seeds 2 or more"):
-        session.mesh(gacrl)
-    assert session.mesh(replace(gacrl, num_seeds=5)).shape == {"seeds": 2, "envs": 1}
+        build.mesh(gacrl)
+    assert build.mesh(replace(gacrl, num_seeds=5)).shape == {"seeds": 2, "envs": 1}
     ippo = preset("ippo")
-    assert session.mesh(ippo).shape == {"seeds": 1, "envs": 2}
-    assert session.mesh(replace(ippo, num_seeds=2)).shape == {"seeds": 2, "envs": 1}
+    assert build.mesh(ippo).shape == {"seeds": 1, "envs": 2}
+    assert build.mesh(replace(ippo, num_seeds=2)).shape == {"seeds": 2, "envs": 1}
     odd = replace(ippo, training=replace(ippo.training, num_envs=9))
     with pytest.raises(UserError, match="num_envs 9 cannot be shared evenly by the 2 devices"):
-        session.mesh(odd)
+        build.mesh(odd)
 
 
 def test_one_process_spreads_environments_only_where_it_pays(monkeypatch: pytest.MonkeyPatch):

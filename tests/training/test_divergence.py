@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from conftest import content
 
-from gacrl import config as configuration
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.cli import main
-from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
-from gacrl.training import session
+from gacrl.algorithms.contract import Algorithm
+from gacrl.cli.main import main
+from gacrl.config import presets
+from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.training import build, session
 from gacrl.training.divergence import Diverged, not_finite
 from gacrl.training.trainer import Trainer
 from gacrl.types import Decision
@@ -46,7 +46,7 @@ def breaking(at: int, loss: float) -> Algorithm:
 
 
 SHORT = RunConfig(
-    env=replace(configuration.preset("paper").env, max_cycles=4),
+    env=replace(presets.preset("paper").env, max_cycles=4),
     training=TrainingConfig(env_steps=60, num_envs=2, num_steps=3),
     evaluation=EvaluationConfig(interval=18, num_episodes=2, final_episodes=2),
     seed=7,
@@ -59,8 +59,8 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
 ):
     """The loss stays finite: it is a parameter, of the fifth update, that is not."""
     folder = tmp_path / "run"
-    monkeypatch.setattr(session.algorithms, "make", lambda *_: breaking(at=5, loss=2.0))
-    monkeypatch.setattr(session, "build", functools.cache(session.build))
+    monkeypatch.setattr(build.build_algorithm, "make", lambda *_: breaking(at=5, loss=2.0))
+    monkeypatch.setattr(session, "make_trainer", functools.cache(build.make_trainer))
     monkeypatch.setattr(Trainer, "evaluate", lambda *_: {"return_agent_mean": np.zeros((1, 2))})
     with pytest.raises(Diverged) as stopped:
         session.start(SHORT, folder)

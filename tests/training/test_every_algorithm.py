@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from conftest import assert_nearly_same
 
-from gacrl import config as configuration
-from gacrl.config import PRESETS, EvaluationConfig, RunConfig, TrainingConfig
-from gacrl.training import session
+from gacrl.config import presets
+from gacrl.config.presets import PRESETS
+from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.training import build, session
 from gacrl.training.session import Run, Watcher
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -30,7 +31,7 @@ ALL = [
 
 def tiny(name: str, **changes: Any) -> RunConfig:
     """A preset on small numbers: everything that it learns with is on from the second update."""
-    preset = configuration.preset(name)
+    preset = presets.preset(name)
     algorithm: Any = preset.algorithm
     small: dict[str, Any] = {"replay_capacity": 40, "batch_size": 4, "learning_starts": 4, "updates": 2}
     small = {field: value for field, value in small.items() if hasattr(algorithm, field)}
@@ -90,7 +91,7 @@ def test_members_are_their_seeds_alone(name: str):
 
     But for a few of QMIX's numbers: where a gradient is next to nothing Adam divides the rounding by it.
     """
-    several, single = (session.build(tiny(name, num_seeds=count)) for count in (2, 1))
+    several, single = (build.make_trainer(tiny(name, num_seeds=count)) for count in (2, 1))
     together, _ = several.chunk(several.init((3, 4)), 10)
     for member, seed in enumerate((3, 4)):
         alone, _ = single.chunk(single.init((seed,)), 10)

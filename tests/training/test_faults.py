@@ -24,17 +24,17 @@ import pytest
 from conftest import TinyRun, content
 
 from gacrl import play
-from gacrl.config import RunConfig
+from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
-from gacrl.experiments import paper_tables
-from gacrl.training import checkpoint, session
+from gacrl.experiments.paper import tables as paper_tables
+from gacrl.training import build, checkpoint, session
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
 from gacrl.training.writer import Writer
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
-BUILD = session.build
+BUILD = build.make_trainer
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 
@@ -49,7 +49,7 @@ def traced_once() -> Iterator[None]:
         )  # of no matter to the paper's
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "build", build)
+        patch.setattr(session, "make_trainer", build)
         patch.setattr(session.episodes, "record_many", lambda *_: [])
         patch.setattr(session.render, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])
@@ -404,7 +404,7 @@ def test_the_best_policy_is_the_one_that_was_evaluated(copy: Path):
     ), "no replay and no optimiser"
 
     config = RunFolder(copy).config()
-    trainer = session.build(config)
+    trainer = build.make_trainer(config)
     learners = session.load_learners(found, trainer)
     played = trainer.evaluate(learners, False, "monitor", config.evaluation.num_episodes)
     np.testing.assert_array_equal(

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gacrl.algorithm_config import GacrlPaperConfig, IppoConfig, MappoConfig, NetworkConfig, PpoConfig, QmixConfig
+from gacrl.config.algorithms import GacrlPaperConfig, IppoConfig, MappoConfig, NetworkConfig, PpoConfig, QmixConfig
 from gacrl.doctor import BEYOND
 from gacrl.envs.probes import BEST_RETURN, PROBES
 from gacrl.training.probing import ProbeResult, probe_algorithm

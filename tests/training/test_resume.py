@@ -23,11 +23,12 @@ import pytest
 import safetensors.numpy
 from conftest import TinyRun
 
-from gacrl import config as configuration
 from gacrl.algorithms.replay import Replay
-from gacrl.cli import main
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config import presets
 from gacrl.errors import UserError
-from gacrl.experiments import paper_tables
+from gacrl.experiments.paper import tables as paper_tables
 from gacrl.training import checkpoint
 from gacrl.training.recorder import RunFolder
 
@@ -65,7 +66,7 @@ def process(quick_start: dict[str, str]) -> Iterator[Any]:
     running: list[subprocess.Popen[str]] = []
 
     def start(*words: object) -> subprocess.Popen[str]:
-        code = f"{OFFLINE}; import jax, sys; jax.config.update('jax_num_cpu_devices', 2); import gacrl.cli; sys.exit(gacrl.cli.main())"
+        code = f"{OFFLINE}; import jax, sys; jax.config.update('jax_num_cpu_devices', 2); from gacrl.cli.main import main; sys.exit(main())"
         running.append(
             subprocess.Popen(
                 [sys.executable, "-c", code, *map(str, words)],
@@ -205,7 +206,7 @@ def test_an_extension_that_dies_before_its_first_checkpoint_goes_on(uninterrupte
 
 def test_a_run_made_before_a_setting_was_added_can_go_on(tmp_path: Path):
     """What its checkpoints belong to is what stands in its file, before and after an extension."""
-    config = configuration.preset("paper")
+    config = presets.preset("paper")
     folder = RunFolder.create(tmp_path / "run", config)
     older = json.loads(folder.config_file.read_text(encoding="utf-8"))
     assert configuration.fingerprint(folder.settings()) == configuration.fingerprint(config)

@@ -21,9 +21,10 @@ from typing import Any
 
 import pytest
 
-from gacrl import config as configuration
-from gacrl.cli import main
-from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.cli.main import main
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("soak")]
 
@@ -36,7 +37,7 @@ TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 def config(env_steps: int) -> RunConfig:
     """IPPO on a few numbers, an evaluation every 16 steps: most of a process goes into starting, all else into writing."""
-    tuned = configuration.preset("ippo")
+    tuned = presets.preset("ippo")
     return replace(
         tuned,
         algorithm=replace(tuned.algorithm, network=replace(tuned.algorithm.network, width=8), update_epochs=2),

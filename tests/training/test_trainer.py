@@ -12,16 +12,17 @@ import pytest
 from jaxtyping import Array
 
 from gacrl import rollout
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.config import EvaluationConfig, RunConfig, TrainingConfig, preset
-from gacrl.envs import scripted
+from gacrl.algorithms.contract import Algorithm
+from gacrl.config.presets import preset
+from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.envs.probes import Probe
-from gacrl.envs.spread import Spread
 from gacrl.errors import UserError
 from gacrl.evaluation.episodes import record_many
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.training import checkpoint, session
+from gacrl.tasks.spread import scripted
+from gacrl.tasks.spread.environment import Spread
+from gacrl.training import build, checkpoint
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import one_seed, without_padding
 from gacrl.training.loop import train
@@ -46,7 +47,7 @@ SMALL = replace(
 def trainers(quick_start: dict[str, str]) -> dict[int, Trainer]:
     """The paper's algorithm for one and for two seeds, on the two devices that there are."""
     assert jax.local_device_count() == 2
-    return {count: session.build(replace(SMALL, num_seeds=count)) for count in (1, 2)}
+    return {count: build.make_trainer(replace(SMALL, num_seeds=count)) for count in (1, 2)}
 
 
 def leaves(tree: Any) -> list[np.ndarray]:
@@ -99,7 +100,7 @@ def test_a_start_compiles_no_program_for_each_leaf(caplog: pytest.LogCaptureFixt
     """Most of a start went into hundreds of tiny programs once."""
     config = replace(SMALL, num_seeds=3)
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        state = session.build(config).init(config.seeds)
+        state = build.make_trainer(config).init(config.seeds)
         one_seed(state, 2)
         without_padding(state, 3)
     assert len(jax.tree.leaves(state)) > 40
@@ -322,7 +323,7 @@ def test_evaluation_does_not_depend_on_what_was_trained_before(trainers: dict[in
 
 def test_every_policy_is_evaluated_from_the_same_starts(trainers: dict[int, Trainer]):
     trainer = trainers[2]
-    env, key = session.evaluation_env(SMALL), stream_key("monitor")
+    env, key = build.evaluation_env(SMALL), stream_key("monitor")
     params = env.default_params()
     noop, nothing = scripted.make("noop", env)
     learner = one_seed(trainer.init((3, 4)).learner, 1)

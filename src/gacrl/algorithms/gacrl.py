@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from gacrl.algorithm_config import GacrlConfig
 from gacrl.algorithms import exploration, q_learning
 from gacrl.algorithms.actions import ActionSet, choices
-from gacrl.algorithms.algorithm import Algorithm
+from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.exploration import Exploration
 from gacrl.algorithms.q_learning import Network, Parts
 from gacrl.algorithms.qmix import summed
 from gacrl.algorithms.shared import taken
-from gacrl.config import TrainingConfig
+from gacrl.config.algorithms import GacrlConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput, matched
 from gacrl.networks.critic import team_mean

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gacrl.algorithm_config import GacrlPaperConfig
 from gacrl.algorithms import replay as ring
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.algorithms.exploration import (
+from gacrl.algorithms.contract import Algorithm
+from gacrl.algorithms.gacrl_paper_exploration import (
     Coverage,
     Schedule,
     adaptive_level,
@@ -25,23 +24,14 @@ from gacrl.algorithms.exploration import (
     linear_decay,
     no_coverage,
 )
-from gacrl.config import TrainingConfig
+from gacrl.config.algorithms import GacrlPaperConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
 from gacrl.networks.graph import neighbour_sum, observed_adjacency
 from gacrl.networks.layers import Linear
 from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel, transmit
-from gacrl.types import (
-    Channel,
-    Decision,
-    Memory,
-    Metrics,
-    Observation,
-    Policy,
-    PRNGKey,
-    Rollout,
-    Transition,
-)
+from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
 
 class MessageModel(eqx.Module):

@@ -1,9 +1,9 @@
 """IPPO (de Witt et al. 2020): PPO whose critic sees no more than its agent does."""
 
-from gacrl.algorithm_config import IppoConfig
 from gacrl.algorithms import ppo
-from gacrl.algorithms.algorithm import Algorithm
-from gacrl.config import TrainingConfig
+from gacrl.algorithms.contract import Algorithm
+from gacrl.config.algorithms import IppoConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 
 

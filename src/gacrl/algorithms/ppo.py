@@ -11,21 +11,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gacrl.algorithm_config import PpoConfig
 from gacrl.algorithms.actions import choices
-from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import play, turn_experience
+from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.exploration import progress_between
-from gacrl.algorithms.objectives import (
-    ValueNorm,
-    clipped_surrogate,
-    follow_returns,
-    huber,
-    no_returns,
-)
+from gacrl.algorithms.objectives import ValueNorm, clipped_surrogate, follow_returns, huber, no_returns
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, sum_over_devices, taken
-from gacrl.config import TrainingConfig
+from gacrl.config.algorithms import PpoConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
 from gacrl.networks.critic import Critic, View

@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.algorithm_config import QLearningConfig
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import choices
-from gacrl.algorithms.algorithm import Algorithm
 from gacrl.algorithms.augmentation import play, turn_experience
+from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.exploration import Exploration, progress_between
 from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
 from gacrl.algorithms.returns import n_step_window, next_values
 from gacrl.algorithms.shared import clipped_adam, share_reward
-from gacrl.config import TrainingConfig
+from gacrl.config.algorithms import QLearningConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput, unroll
 from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition

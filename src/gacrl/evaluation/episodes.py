@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl import rollout
-from gacrl.envs.spread import CAPTURE_RADIUS, Spread, SpreadParams, unpack_state
+from gacrl.tasks.spread.environment import CAPTURE_RADIUS, Spread, SpreadParams, unpack_state
 from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Transition
 
 

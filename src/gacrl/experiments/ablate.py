@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gacrl import config as configuration
-from gacrl import envs
-from gacrl.algorithm_config import GacrlConfig
+from gacrl import tasks
 from gacrl.algorithms.actions import choices
-from gacrl.config import RunConfig
+from gacrl.config import files as configuration
+from gacrl.config.algorithms import GacrlConfig
+from gacrl.config.checks import unknown
+from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.statistics import (
     Curve,
@@ -143,7 +144,7 @@ def ablate(
         raise UserError(f"--preset {config.preset} has no parts to take away: name a GACRL preset")
     for name in parts:
         if name not in PARTS:
-            raise UserError(configuration.unknown("part", name, list(PARTS)))
+            raise UserError(unknown("part", name, list(PARTS)))
     steps = config.training.env_steps if env_steps is None else env_steps
     configured = config.algorithm.updates
     updates = max(configured // 2, 1) if updates is None else updates
@@ -202,7 +203,7 @@ def _yoked(run: Planned, full: Planned) -> Planned:
 
 
 def _num_parameters(config: RunConfig) -> int:
-    env = envs.make(config.env)
+    env = tasks.make(config.env)
     network = config.algorithm.network  # pyright: ignore[reportAttributeAccessIssue] GACRL's, checked
     actions = choices(env).size
     return acting_parameters(env, matched(env, network, actions), actions)

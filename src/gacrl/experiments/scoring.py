@@ -7,18 +7,18 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from gacrl import envs
-from gacrl.algorithm_config import LearningConfig
-from gacrl.config import EnvConfig
-from gacrl.envs import scripted
-from gacrl.envs.spread import Spread
+from gacrl import tasks
+from gacrl.adapters import mpe2
+from gacrl.config.algorithms import LearningConfig
+from gacrl.config.run import EnvConfig
 from gacrl.evaluation import episodes as recording
-from gacrl.evaluation import mpe2
 from gacrl.evaluation.evaluate import stream_key
-from gacrl.evaluation.messages import bits_used
+from gacrl.evaluation.references import play_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
+from gacrl.messages.bits import bits_used
 from gacrl.play import TrainedRun, open_run
-from gacrl.training.session import play_scripted
+from gacrl.tasks.spread import scripted
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Memory, Policy
 
 Warn = Callable[[str], None]
@@ -57,7 +57,7 @@ def score_run(
     changes = changes or Changes()
     messages = None
     if run in scripted.PLAYABLE:
-        env = envs.make(changes.apply(EnvConfig()))
+        env = tasks.make(changes.apply(EnvConfig()))
         references = _references(env, episodes, backend)
         metrics = references.get(run) or _scripted(run, env, episodes, backend)
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
@@ -108,7 +108,7 @@ def record_run(
     policy: Policy
     memory: Memory
     if run in scripted.PLAYABLE:
-        env = envs.make(changes.apply(EnvConfig()))
+        env = tasks.make(changes.apply(EnvConfig()))
         policy, memory = scripted.make(run, env)
     else:
         opened = open_run(run, changes.apply, warn)

@@ -16,8 +16,10 @@ from typing import Any, Literal
 
 from scipy.stats import qmc
 
-from gacrl import config as configuration
-from gacrl.config import RunConfig
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.checks import unknown
+from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing, why_diverged
@@ -126,7 +128,7 @@ def load(path: Path) -> Spec:
 def _spec(data: Mapping[str, Any]) -> Spec:
     for key in data:
         if key not in _KEYS:
-            raise ConfigError(configuration.unknown("key", key, list(_KEYS)))
+            raise ConfigError(unknown("key", key, list(_KEYS)))
     for key in ("metric", "trials", "search"):
         if key not in data:
             raise ConfigError(f"it does not say {key}: a search needs metric, trials and [search]")
@@ -143,7 +145,7 @@ def _spec(data: Mapping[str, Any]) -> Spec:
         )
     searched = tuple(_searched(setting, given, config) for setting, given in ranges.items())
     if data["metric"] not in EPISODE_METRICS:
-        raise ConfigError(configuration.unknown("metric", str(data["metric"]), list(EPISODE_METRICS)))
+        raise ConfigError(unknown("metric", str(data["metric"]), list(EPISODE_METRICS)))
     return Spec(config, searched, data["metric"], direction == "maximize", trials)
 
 
@@ -152,7 +154,7 @@ def _base(data: Mapping[str, Any]) -> RunConfig:
     fixed = data.get("fixed", {})
     if not isinstance(fixed, Mapping):
         raise ConfigError("[fixed] must be a table of settings")
-    changes: dict[str, Any] = {"preset": data.get("preset", configuration.DEFAULT_PRESET)}
+    changes: dict[str, Any] = {"preset": data.get("preset", presets.DEFAULT_PRESET)}
     for key, setting in (("seeds", "num_seeds"), ("seed", "seed")):
         if key in data:
             changes[setting] = data[key]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gacrl.config import RunConfig
+from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.training import session
 from gacrl.training.devices import release_memory

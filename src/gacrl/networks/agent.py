@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks import communication
 from gacrl.networks import torso as torsos

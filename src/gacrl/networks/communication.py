@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, transmit

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks import torso as torsos
 from gacrl.networks.gru import Gru

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from gacrl.algorithm_config import NetworkConfig
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment, SpatialEnvironment
 from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Mlp, Score

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from gacrl.config import CurriculumConfig
+from gacrl.config.run import CurriculumConfig
 from gacrl.envs.environment import EnvParams
 from gacrl.types import Rollout
 

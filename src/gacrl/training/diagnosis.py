@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax
 
-from gacrl.training import session
+from gacrl.training import build, session
 from gacrl.training.divergence import not_finite
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Watcher
@@ -47,8 +47,8 @@ def diagnose(path: Path, watcher: Watcher | None = None) -> Diagnosis:
     with folder.locked():
         config = folder.config()
         found = session.newest_checkpoint(folder, watcher.warn)
-        trainer = session.build(config)
-        watcher.planned(folder, config, session.plan(trainer, config))
+        trainer = build.make_trainer(config)
+        watcher.planned(folder, config, build.plan(trainer, config))
         state = session.restore(trainer, config, found)
     begun = 0 if found is None else found.env_steps
     done = first = begun // config.steps_per_update

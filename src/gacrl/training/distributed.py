@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import jax
 
-from gacrl.config import RunConfig
+from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.training.devices import wait_for_all
 from gacrl.training.peers import Peers, Place, meet

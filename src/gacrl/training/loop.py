@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gacrl.config import RunConfig
+from gacrl.config.run import RunConfig
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState

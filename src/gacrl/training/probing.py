@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gacrl.algorithm_config import AlgorithmConfig
-from gacrl.algorithms import algorithm as algorithms
-from gacrl.config import TrainingConfig
+from gacrl.algorithms import build as algorithms
+from gacrl.config.algorithms import AlgorithmConfig
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.probes import PROBES, Probe, ProbeParams
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.curriculum import constant

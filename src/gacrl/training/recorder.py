@@ -10,8 +10,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from gacrl import config as configuration
-from gacrl.config import RunConfig
+from gacrl.config import files as configuration
+from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 
 

@@ -3,27 +3,22 @@
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
-from jax.sharding import Mesh
 
-from gacrl import config as configuration
-from gacrl import envs, render
-from gacrl.algorithm_config import GacrlConfig, LearningConfig, PpoConfig
-from gacrl.algorithms import algorithm as algorithms
-from gacrl.config import RunConfig
-from gacrl.envs import scripted
-from gacrl.envs.spread import Spread
+from gacrl import render
+from gacrl.config import files as configuration
+from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes
-from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
-from gacrl.training import checkpoint, curriculum, memory
-from gacrl.training.devices import anyone, gathered, leads, mesh_for, one_seed, same_everywhere, shard_seeds
+from gacrl.training import checkpoint
+from gacrl.training.build import Plan, evaluation_env, make_trainer, plan, stacked_shapes
+from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged
 from gacrl.training.keeper import FOR_LEARNING, ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
@@ -50,19 +45,6 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a run is going to be: known before anything is allocated or compiled."""
-
-    parameters: int
-    """Numbers that a seed's network learns."""
-    bytes_per_seed: int
-    """Memory of a seed's training state (networks, optimiser, replay, environments)."""
-    bytes_needed: int
-    """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it."""
-    devices: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Watcher:
     """What a run tells whoever looks on, and asks: all of it optional."""
 
@@ -74,58 +56,9 @@ class Watcher:
     stop: Callable[[], bool] = lambda: False
 
 
-def build(config: RunConfig, devices: Mesh | None = None) -> Trainer:
-    """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`."""
-    env = envs.make(config.env)
-    if config.env.reward == "potential" and isinstance(config.algorithm, LearningConfig):
-        env = replace(env, initial_params=env.initial_params._replace(potential_discount=config.algorithm.gamma))
-    if config.curriculum.num_agents_start is not None:
-        env = env.padded()
-    return Trainer(
-        algorithm=algorithms.make(config.algorithm, env, config.training),
-        env=env,
-        curriculum=curriculum.make(config.curriculum),
-        num_envs=config.training.num_envs,
-        num_steps=config.training.num_steps,
-        num_seeds=config.num_seeds,
-        evaluation_env=evaluation_env(config),
-        mesh=mesh(config) if devices is None else devices,
-        # GACRL's program is as quick when it is quickly compiled, others' 3 to 10 % slower (docs/design.md).
-        for_speed=not isinstance(config.algorithm, GacrlConfig),
-    )
-
-
-def mesh(config: RunConfig) -> Mesh:
-    """The devices that train this configuration: PPO learns from environments that are spread over several."""
-    return mesh_for(
-        config.num_seeds, config.training.num_envs if isinstance(config.algorithm, PpoConfig) else None
-    )
-
-
-def evaluation_env(config: RunConfig) -> Spread:
-    """The task as it is evaluated: with the evaluation's own horizon, where it has one."""
-    env, horizon = envs.make(config.env), config.evaluation.horizon
-    return env if horizon is None else replace(env, max_cycles=horizon)
-
-
-def plan(trainer: Trainer, config: RunConfig) -> Plan:
-    """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
-    member, devices = _member_shapes(trainer), list(trainer.mesh.devices.flat)
-    state, working = memory.size(member), memory.working_bytes(config, member)
-    needed = 2 * state * config.num_seeds + working * len(devices)
-    memory.require_room(needed, devices[0])
-    network = getattr(member.learner, "network", ())
-    return Plan(
-        parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
-        bytes_per_seed=state,
-        bytes_needed=needed,
-        devices=tuple(f"{device.platform}:{device.id}" for device in devices),
-    )
-
-
 def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
     """Train from the beginning, into a new run folder."""
-    watcher, trainer = watcher or Watcher(), build(config)
+    watcher, trainer = watcher or Watcher(), make_trainer(config)
     planned = plan(trainer, config)
     folder = RunFolder.create(out, config) if leads() else RunFolder(out or Path("runs"))
     with folder.locked() if leads() else nullcontext():
@@ -146,7 +79,7 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-        trainer = build(config)
+        trainer = make_trainer(config)
         planned = plan(trainer, config)
         if leads():
             checkpoint.set_aside_damaged(folder.checkpoints)
@@ -188,7 +121,7 @@ def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | 
     """The training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
-    return shard_seeds(checkpoint.load(found, _stacked_shapes(trainer)), trainer.mesh)
+    return shard_seeds(checkpoint.load(found, stacked_shapes(trainer)), trainer.mesh)
 
 
 def _run(
@@ -283,39 +216,8 @@ def _finish(
     return summary
 
 
-def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, float]]:
-    """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
-    return {name: play_scripted(name, env, num_episodes) for name in scripted.SCRIPTED}
-
-
-def play_scripted(name: str, env: Spread, num_episodes: int) -> dict[str, float]:
-    """The metrics of one scripted policy there."""
-    metrics = scripted_program(name, env, num_episodes)(env.default_params(), stream_key("report"))
-    return {metric: float(np.mean(values)) for metric, values in metrics.items()}
-
-
-@cache
-def scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[..., dict[str, jax.Array]]:
-    """A scripted policy's evaluation, traced once a process."""
-    actor = scripted.make(name, env)
-    return jax.jit(
-        lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
-    )
-
-
-def _member_shapes(trainer: Trainer) -> TrainState:
-    return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
-
-
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
-    shapes = _stacked_shapes(trainer).learner
+    shapes = stacked_shapes(trainer).learner
     learners = checkpoint.load(found, shapes, prefix=".learner", skip=FOR_LEARNING)
     return shard_seeds(learners, trainer.mesh)
-
-
-def _stacked_shapes(trainer: Trainer) -> TrainState:
-    """The shapes of the training state of all seeds, as a checkpoint holds it."""
-    return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct((trainer.num_seeds, *leaf.shape), leaf.dtype), _member_shapes(trainer)
-    )

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from gacrl import rollout
-from gacrl.algorithms.algorithm import Algorithm, Hyper
+from gacrl.algorithms.contract import Algorithm, Hyper
 from gacrl.algorithms.shared import share_out
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation.evaluate import Stream, evaluate, stream_key

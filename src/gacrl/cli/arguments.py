@@ -1,0 +1,332 @@
+"""What each command understands, as dataclasses; their docstrings are the help."""
+
+import contextlib
+import difflib
+import io
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+
+from gacrl.config import presets
+from gacrl.config.run import RunConfig
+from gacrl.errors import UserError
+
+Arguments = TypeVar("Arguments")
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Several processes as one: each is started with the same command."""
+
+    distributed: bool = False
+    """Be one of several processes (docs/guides/cluster.md); SLURM, Open MPI, Kubernetes or JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID say which, or these three:"""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, with --distributed."""
+    num_processes: int | None = None
+    """How many there are."""
+    process_id: int | None = None
+    """Which of them this is, from 0."""
+    wait: float = 120.0
+    """Seconds to wait for the others."""
+
+    def check(self) -> None:
+        """Raises UserError where half of it is said."""
+        given = [self.coordinator, self.num_processes, self.process_id]
+        if not self.distributed and given != [None] * 3:
+            raise UserError("--coordinator, --num-processes and --process-id need --distributed")
+        if self.wait < 1:
+            raise UserError(f"--wait must be at least 1 second, not {self.wait:g}")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train, with a live progress line, and write a run folder.
+
+    Settings come from the preset, then --config, then the flags below.
+
+    examples:
+      gacrl train                                     GACRL that solves the task
+      gacrl train --preset paper --num-seeds 2        the paper's whole schedule, a seed on each core
+      gacrl train --preset paper --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
+      gacrl train --config my.json --seed 7           `gacrl config` prints such a file
+    """
+
+    settings: Annotated[RunConfig, tyro.conf.arg(name="")]
+    config: Path | None = None
+    """A JSON file of settings, all or some."""
+    env_steps: int | None = None
+    """Environment steps of each seed (short for --training.env-steps)."""
+    episodes: int | None = None
+    """The same, counted in episodes."""
+    out: Path | None = None
+    """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Go on exactly where a run stopped: it ends with the same bits as one that never did.
+
+    examples:
+      gacrl resume runs/paper-1
+      gacrl resume runs/paper-1 --extend 37500        500 more episodes of 75 steps
+      gacrl resume runs/paper-1 --diagnose            which update it was that diverged
+    """
+
+    run: tyro.conf.Positional[Path]
+    """A run folder."""
+    extend: int | None = None
+    """Environment steps to train past the planned end."""
+    diagnose: bool = False
+    """Play what follows the newest checkpoint again, one update at a time, and print the first that is not finite;
+    nothing is written."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a policy on fixed episodes: greedy and sampled, beside random, noop and oracle.
+
+    RUN is a run folder, FOLDER@k for its member k, FOLDER@best for how it was when it scored best, or random, noop,
+    oracle, or local (an oracle that sees what is near and assigns nothing). Every score_ is 0 for random and 1 for
+    oracle on the same starts.
+
+    examples:
+      gacrl evaluate runs/paper-1
+      gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
+      gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
+    """
+
+    run: tyro.conf.Positional[str]
+    episodes: int = 320
+    """Episodes to play."""
+    horizon: int | None = None
+    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    backend: Literal["jax", "mpe2"] = "jax"
+    """Our environment, or the real MPE2."""
+    num_agents: int | None = None
+    """Play with another number of agents and landmarks."""
+    arena_scale: float | None = None
+    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw episodes as an animated GIF: agents, landmarks, edges, message symbols, coverage.
+
+    examples:
+      gacrl render runs/paper-1 --out paper.gif
+      gacrl render oracle --out oracle.gif --episodes 2
+    """
+
+    run: tyro.conf.Positional[str]
+    out: Path = field(default=Path("episodes.gif"))
+    """The file to write; one that exists is not overwritten without --overwrite."""
+    episodes: int = 4
+    """Episodes to show."""
+    horizon: int | None = None
+    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    num_agents: int | None = None
+    """Play with another number of agents and landmarks."""
+    arena_scale: float | None = None
+    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    sampled: bool = False
+    """Explore as in training, instead of playing greedily."""
+    size: int = 480
+    """Width and height in pixels."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare finished runs: interquartile means over seeds with 95 % intervals, differences, chances to be better.
+
+    Runs that differ in the seed alone are one group. Settings that make a comparison unequal are named; runs
+    of other tasks, horizons or versions of the environment are refused.
+
+    examples:
+      gacrl compare runs/mappo-1 runs/qmix-1
+      gacrl compare runs/gacrl-1 runs/gacrl-2 runs/vdn-1 --metric coverage_final_0.1 --out runs/comparison
+      gacrl compare runs/gacrl-1 runs/vdn-1 --metric coverage_final_0.1 --margin 0.02
+    """
+
+    run: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A metric of the closing evaluation; may be given several times. None: return and coverage within 0.1."""
+    margin: float | None = None
+    """Also test whether groups differ by less than this, in the units of the one metric (two one-sided tests)."""
+    sampled: bool = False
+    """Compare the policies as they explore, instead of greedily."""
+    out: Path | None = None
+    """A folder for the comparison as a page (HTML and Markdown) with figures."""
+    marl_eval: Path | None = None
+    """A file to write the runs into as marl-eval's raw data."""
+    overwrite: bool = False
+    """Replace a page or file that exists."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Presets:
+    """List what can be trained by name.
+
+    example:
+      gacrl presets
+    """
+
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Print a preset's settings, complete, as a file that `gacrl train --config FILE` loads.
+
+    example:
+      gacrl config --preset paper > my.json
+    """
+
+    preset: str = presets.DEFAULT_PRESET
+    """Which preset."""
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Make the paper's whole experiment, and a report of every table, figure and claim, theirs beside ours.
+
+    GACRL, QMIX, MAPPO and IPPO train on the paper's reward and on MPE2's own; random, noop and oracle play the
+    same task. Stopped or killed, the same command goes on with what is missing.
+
+    examples:
+      gacrl reproduce                                 5 seeds
+      gacrl reproduce --seeds 2 --episodes 200 --out runs/look
+    """
+
+    seeds: int = 5
+    """Seeds of each algorithm."""
+    episodes: int = 1500
+    """Episodes of each seed; fewer stop the paper's schedule early."""
+    out: Path = Path("runs/reproduce")
+    """The folder of the runs and the report."""
+    extended: bool = False
+    """Also train them, and VDN, in earnest: MPE2's 25 steps, equal torso, symmetry, reward and number of steps."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Train GACRL with every part off in turn, and say what each part is worth, with intervals over seeds.
+
+    What a part's parameters were goes to the rest of the network, so that all have as many. Stopped or killed, the same
+    command goes on with what is missing.
+
+    examples:
+      gacrl ablate                                    every part, 5 seeds, 112,500 steps each
+      gacrl ablate --part no-messages --part no-graph --seeds 2 --env-steps 30000 --out runs/look
+    """
+
+    preset: str = "gacrl-112k"
+    """The preset that is taken apart, a GACRL one."""
+    part: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """What is taken away; may be given several times. None: everything."""
+    seeds: int = 5
+    """Seeds of each."""
+    seed: int = 0
+    """The first of them."""
+    env_steps: int | None = None
+    """Environment steps of each seed; none: the preset's."""
+    updates: int | None = None
+    """Gradient steps after each rollout; none: half of the preset's; all of it takes about an hour on two cores."""
+    out: Path = Path("runs/ablation")
+    """The folder of the runs and the report."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Search settings: a file of ranges, or the paper's grid. Stopped or killed, the same command goes on.
+
+    FILE.toml says what is searched and by which metric (docs/guides/cluster.md); every trial is a run folder. Trials
+    are trained here, one after the other, or on a Ray cluster, where Optuna proposes them and poor ones are given up.
+
+    paper-grid is the paper's: learning rate × ε₀ × τ₀, 27 points in one program, by shaped reward over the first 500
+    episodes; the winner is trained again on fresh seeds beside the paper's choice, and beside what chance alone makes.
+
+    examples:
+      gacrl sweep search.toml
+      gacrl sweep search.toml --ray 10.0.0.1:6379     pip install 'gacrl[ray]'
+      gacrl sweep paper-grid --out runs/grid
+    """
+
+    spec: tyro.conf.Positional[str]
+    """A TOML file, or paper-grid."""
+    ray: str | None = None
+    """HOST:PORT of a Ray cluster's head, or auto."""
+    trial_cpus: float = 1.0
+    """CPU cores that a trial takes, with --ray."""
+    trial_gpus: float = 0.0
+    """And GPUs."""
+    seeds: int | None = None
+    """Seeds of each point of paper-grid; none: 2."""
+    episodes: int | None = None
+    """Episodes of each seed of paper-grid; none: 500."""
+    out: Path | None = None
+    """The folder of the results and the report; none: runs/ and the name of the file or grid."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check this machine: devices, parity with the installed MPE2, and that algorithms learn the probes.
+
+    example:
+      gacrl doctor
+    """
+
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+def parse(kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None) -> Arguments:
+    """The arguments by their dataclass. Raises UserError with one sentence for what cannot be understood."""
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                kind, prog=f"gacrl {command}", args=words, config=(tyro.conf.AvoidSubcommands,), **given
+            )
+    except SystemExit as stop:
+        if stop.code == 0:
+            raise
+        raise UserError(_sentence(said.getvalue(), command)) from None
+
+
+def _sentence(box: str, command: str) -> str:
+    """One sentence out of the parser's box: what is wrong, and the nearest option there is."""
+    lines = [line.strip("│ ") for line in box.splitlines()[1:]]  # the first one is the box's title
+    lines = [line if line.strip("╰╯─-") else "" for line in lines]
+    problem = "\n".join(lines).strip().split("\n\n")[0].replace("\n", " ")
+    problem = re.sub(r"^Error parsing (?!--)\S+: ", "", problem).rstrip(". ")
+    problem = problem[:1].lower() + problem[1:]
+    wrong = re.findall(r"--[\w.-]+", problem)
+    options = [line.split()[0] for line in lines if line.startswith("--")]
+    near = difflib.get_close_matches(wrong[0], options, n=1, cutoff=0.3) if wrong else []
+    mend = f"did you mean {near[0]}?" if near and near[0] not in problem else f"see `gacrl {command} --help`"
+    return f"{problem}: {mend}"

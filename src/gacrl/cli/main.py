@@ -1,0 +1,435 @@
+"""The command line: parse, then call one function each.
+
+Nothing heavy is imported before a command is known: `gacrl --help` answers at once.
+"""
+
+import contextlib
+import json
+import signal
+import sys
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gacrl.config import files as configuration
+from gacrl.config import presets
+from gacrl.config.checks import unknown
+from gacrl.config.run import RunConfig
+from gacrl.errors import UserError, reason
+
+if TYPE_CHECKING:
+    from gacrl.cli.arguments import Cluster, Resume, Sweep
+    from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
+    from gacrl.experiments.ablate import Ablation
+    from gacrl.experiments.paper.reproduce import Reproduction
+    from gacrl.experiments.search import Search
+    from gacrl.experiments.study import Watch
+    from gacrl.training.session import Run, Watcher
+
+OVERVIEW = """\
+gacrl: learning to coordinate by communicating over a graph
+
+usage: gacrl COMMAND [OPTIONS]
+
+  train      train a preset or your own settings into a new run folder
+  resume     go on exactly where a run stopped, or past its end
+  evaluate   measure a run, random, noop or oracle, here or in the real MPE2
+  render     watch a run, random, noop or oracle: a GIF
+  compare    runs side by side: intervals over seeds, differences, what else differs
+  reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
+  ablate     every part of GACRL off in turn: what each is worth
+  sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
+  presets    what can be trained by name
+  config     print a preset's settings as a file to change and load
+  doctor     does this machine work, and do the algorithms learn what they must
+
+`gacrl COMMAND --help` explains a command, with examples. Some to begin with:
+
+  gacrl train
+  gacrl evaluate runs/gacrl-1 --backend mpe2
+  gacrl render oracle --out oracle.gif
+"""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if words is None else words)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(OVERVIEW, end="")
+        return 0
+    if words[0] == "--version":
+        from gacrl.versions import version
+
+        print(f"gacrl {version()}")
+        return 0
+    try:
+        if words[0] not in _COMMANDS:
+            raise UserError(unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
+        return _COMMANDS[words[0]](words[1:])
+    except UserError as error:
+        print(f"gacrl: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # whoever read our output has seen enough
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        name = f" {error.filename}" if error.filename else ""
+        print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:  # JAX's own; its class would have to be imported
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        said = str(error).partition("\n")[0].partition(": ")[2].rstrip(" .")
+        print(
+            f"gacrl: the device's memory is full ({said}): take fewer seeds, environments or agents, or end what else "
+            "is using it",
+            file=sys.stderr,
+        )
+        return 2
+    except KeyboardInterrupt:
+        print("gacrl: interrupted", file=sys.stderr)
+        return 130
+
+
+def _train(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    words = ["--env.name" if word == "--env" else word for word in words]
+    asked = arguments.parse(arguments.Train, words, "train", default=arguments.Train(_base_settings(words)))
+    config = asked.settings
+    if asked.env_steps is not None and asked.episodes is not None:
+        raise UserError("--env-steps and --episodes say the same thing: give one of them")
+    env_steps = asked.env_steps if asked.episodes is None else asked.episodes * config.env.max_cycles
+    if env_steps is not None:
+        config = replace(config, training=replace(config.training, env_steps=env_steps))
+
+    def start(watcher: "Watcher") -> "Run":
+        from gacrl.training import session
+
+        return session.start(config, asked.out, watcher)
+
+    return _watched(start, asked.json, config, asked.cluster)
+
+
+def _resume(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Resume, words, "resume")
+    if asked.extend is not None and asked.extend < 1:
+        raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
+    if asked.diagnose:
+        return _diagnose(asked)
+    from gacrl.training import recorder
+
+    config = recorder.RunFolder.open(asked.run).config()
+    if asked.extend is not None:
+        env_steps = config.training.env_steps + asked.extend
+        config = replace(config, training=replace(config.training, env_steps=env_steps))
+
+    def resume(watcher: "Watcher") -> "Run":
+        from gacrl.training import session
+
+        return session.resume(asked.run, asked.extend, watcher)
+
+    return _watched(resume, asked.json, config, asked.cluster)
+
+
+def _diagnose(asked: "Resume") -> int:
+    if asked.extend is not None:
+        raise UserError("--diagnose writes nothing: leave --extend out")
+    if asked.cluster.distributed:
+        raise UserError("--diagnose is done by one process: leave --distributed out")
+    from gacrl.training import devices, recorder
+
+    devices.prepare_jax(recorder.RunFolder.open(asked.run).config().num_seeds)
+    from gacrl.cli.terminal import TerminalWatcher, print_diagnosis
+    from gacrl.training import diagnosis
+
+    with TerminalWatcher() as terminal:
+        found = diagnosis.diagnose(asked.run, terminal.watcher())
+    print_diagnosis(found)
+    if asked.json:
+        print(json.dumps(asdict(found)))
+    return 0
+
+
+def _watched(work: Callable[["Watcher"], "Run"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
+    """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
+    cluster.check()
+    from gacrl.cli.terminal import TerminalWatcher
+    from gacrl.training import devices, distributed
+
+    place = distributed.ALONE
+    if cluster.distributed:
+        place = distributed.find_place(cluster.coordinator, cluster.num_processes, cluster.process_id)
+    devices.prepare_jax(-(-config.num_seeds // place.count))
+    with (
+        TerminalWatcher(quiet=place.process > 0) as terminal,
+        _stopping(terminal),
+        distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
+    ):
+        run = work(watcher)
+    terminal.report(run)
+    if as_json and not terminal.quiet:
+        print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
+    return 0 if run.summary is not None else terminal.exit_code
+
+
+@contextlib.contextmanager
+def _stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
+    """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
+
+    def handler(number: int, frame: Any) -> None:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        terminal.request_stop(128 + number)
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _base_settings(words: list[str]) -> RunConfig:
+    """The settings under the flags: the preset's, then those of --config; both change what --help shows."""
+    named: dict[str, str] = {}
+    for word, following in zip(words, [*words[1:], ""], strict=False):
+        flag, _, value = word.partition("=")
+        if flag in ("--preset", "--config"):
+            named[flag] = value or following
+            if not named[flag] or named[flag].startswith("--"):
+                raise UserError(f"{flag} needs a value: see `gacrl train --help`")
+    if "--config" not in named:
+        return presets.preset(named.get("--preset", presets.DEFAULT_PRESET))
+    base = presets.preset(named["--preset"]) if "--preset" in named else None
+    return configuration.load(Path(named["--config"]), base)
+
+
+def _evaluate(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Evaluate, words, "evaluate")
+    if asked.episodes < 1:
+        raise UserError(f"--episodes must be at least 1, not {asked.episodes}")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax()
+    from gacrl.cli.terminal import print_evaluation
+    from gacrl.experiments import scoring
+
+    scores = scoring.score_run(
+        asked.run,
+        episodes=asked.episodes,
+        changes=scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale),
+        backend=asked.backend,
+        warn=_warn,
+    )
+    print_evaluation(scores)
+    if asked.json:
+        print(json.dumps(scores))
+    return 0
+
+
+def _render(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Render, words, "render")
+    if not 1 <= asked.episodes <= 100:
+        raise UserError(f"--episodes must be between 1 and 100, not {asked.episodes}")
+    if not 120 <= asked.size <= 4096:
+        raise UserError(f"--size must be between 120 and 4096 pixels, not {asked.size}")
+    if asked.out.exists() and not asked.overwrite:
+        raise UserError(f"{asked.out} exists: choose another --out, or say --overwrite")
+    if not asked.out.parent.is_dir():
+        raise UserError(f"there is no folder {asked.out.parent} to write {asked.out.name} into")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax()
+    from gacrl import render
+    from gacrl.experiments import scoring
+
+    changes = scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale)
+    shown = scoring.record_run(asked.run, asked.episodes, changes, asked.sampled, _warn)
+    render.gif(shown, asked.out, size=asked.size, title=asked.run)
+    print(f"{asked.out}: {len(shown)} episodes of {asked.run}")
+    return 0
+
+
+def _compare(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Compare, words, "compare")
+    from gacrl.experiments.compare import compare
+    from gacrl.experiments.compare import data as compare_data
+    from gacrl.experiments.compare import report as compare_report
+
+    files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval]
+    for path in files:
+        if path is not None and path.exists() and not asked.overwrite:
+            raise UserError(f"{path} exists: choose another place, or say --overwrite")
+    play = "sampled" if asked.sampled else "greedy"
+    comparison = compare.compare(asked.run, asked.metric or compare.METRICS, play, _warn, asked.margin)
+    compare_report.print_comparison(comparison)
+    if asked.out is not None:
+        print(f"page       {compare_report.write_page(comparison, asked.out)}")
+    if asked.marl_eval is not None:
+        asked.marl_eval.write_text(json.dumps(compare_data.to_marl_eval(comparison)) + "\n", encoding="utf-8")
+        print(f"marl-eval  {asked.marl_eval}")
+    if asked.json:
+        print(json.dumps(compare_data.to_dict(comparison)))
+    return 0
+
+
+def _reproduce(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Reproduce, words, "reproduce")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(max(asked.seeds, 1))
+    from gacrl.experiments.paper import reproduce
+
+    def study(watch: "Watch") -> "Reproduction | None":
+        return reproduce.reproduce(asked.out, asked.seeds, asked.episodes, asked.extended, watch)
+
+    return _studied(study, asked.out, asked.json)
+
+
+def _studied(
+    study: Callable[["Watch"], "Ablation | Reproduction | Search | None"], out: Path, as_json: bool
+) -> int:
+    """Make a study of many runs under the eyes of the terminal; Ctrl-C ends as in training."""
+    from gacrl.cli.terminal import RunsWatcher
+    from gacrl.experiments.study import Watch
+
+    with RunsWatcher() as terminal, _stopping(terminal):
+        done = study(Watch(terminal.planned, terminal.watcher, terminal.finished, terminal.say))
+    if done is None:
+        print(f"stopped; the same command goes on with what is missing in {out}")
+        return terminal.exit_code
+    print(f"report     {done.report}")
+    if as_json:
+        print(json.dumps(done.to_dict()))
+    return 0
+
+
+def _ablate(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Ablate, words, "ablate")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(max(asked.seeds, 1))
+    from gacrl.experiments import ablate
+
+    def study(watch: "Watch") -> "Ablation | None":
+        config = replace(presets.preset(asked.preset), seed=asked.seed)
+        return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
+
+    return _studied(study, asked.out, asked.json)
+
+
+def _sweep(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Sweep, words, "sweep")
+    out = asked.out or Path("runs") / Path(asked.spec).stem
+    if asked.spec != "paper-grid":
+        return _search(asked, out)
+    if asked.ray is not None:
+        raise UserError("paper-grid is one compiled program and needs no cluster: leave --ray out")
+    seeds = 2 if asked.seeds is None else asked.seeds
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(27 * max(seeds, 1))
+    from gacrl.experiments.paper import grid as sweep
+
+    grid = sweep.paper_grid(seeds, 500 if asked.episodes is None else asked.episodes)
+    done = sweep.sweep(grid, out, say=lambda line: print(line, flush=True))
+    print(f"report     {done.report}")
+    if asked.json:
+        print(json.dumps(done.to_dict()))
+    return 0
+
+
+def _search(asked: "Sweep", out: Path) -> int:
+    """A search that a file describes, here or on a cluster."""
+    if asked.seeds is not None or asked.episodes is not None:
+        raise UserError(f"--seeds and --episodes are for paper-grid: say seeds and env_steps in {asked.spec}")
+    if asked.trial_cpus <= 0 or asked.trial_gpus < 0:
+        raise UserError("--trial-cpus must be above 0, and --trial-gpus not below it")
+    from gacrl.experiments import search
+    from gacrl.training.devices import prepare_jax
+
+    spec = search.load(Path(asked.spec))
+    prepare_jax(spec.config.num_seeds)
+
+    def study(watch: "Watch") -> "search.Search | None":
+        if asked.ray is None:
+            return search.search(spec, out, watch)
+        from gacrl.experiments.ray_search import ray_search
+
+        return ray_search(spec, out, asked.ray, asked.trial_cpus, asked.trial_gpus, watch)
+
+    return _studied(study, out, asked.json)
+
+
+def _presets(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Presets, words, "presets")
+    for name, (description, _) in presets.PRESETS.items():
+        default = "  (the default)" if name == presets.DEFAULT_PRESET else ""
+        print(f"{name:12} {description}{default}")
+    if asked.json:
+        print(json.dumps({name: description for name, (description, _) in presets.PRESETS.items()}))
+    return 0
+
+
+def _config(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Config, words, "config")
+    print(configuration.dumps(presets.preset(asked.preset)), end="")
+    return 0
+
+
+def _doctor(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Doctor, words, "doctor")
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax()
+    from gacrl.doctor import examine
+
+    healthy = True
+    findings: dict[str, Any] = {}
+    for finding in examine():
+        print(f"{'ok ' if finding.good else 'BAD'} {finding.what}: {finding.detail}", flush=True)
+        findings[finding.what] = {"good": finding.good, "detail": finding.detail}
+        healthy &= finding.good
+    if asked.json:
+        print(json.dumps(findings))
+    return 0 if healthy else 1
+
+
+def _warn(sentence: str) -> None:
+    print(f"gacrl: {sentence}", file=sys.stderr)
+
+
+_COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": _train,
+    "resume": _resume,
+    "evaluate": _evaluate,
+    "render": _render,
+    "compare": _compare,
+    "reproduce": _reproduce,
+    "ablate": _ablate,
+    "sweep": _sweep,
+    "presets": _presets,
+    "config": _config,
+    "doctor": _doctor,
+}

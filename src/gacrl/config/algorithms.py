@@ -1,0 +1,317 @@
+"""The settings of the algorithms and of the network that they share: one frozen dataclass each.
+
+A leaf, as `config` is: it imports no jax. Every default has its home here; what the presets set is in `config`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import ClassVar, Literal, TypeAlias
+
+from gacrl.config.checks import between, require
+
+
+@dataclass(frozen=True)
+class GacrlPaperConfig:
+    """The paper's algorithm, as printed (docs/algorithm.md)."""
+
+    name: ClassVar[str] = "gacrl_paper"
+
+    learning_rate: float = 5e-4
+    """Adam's step size at the start."""
+    learning_rate_end: float = 1e-4
+    """And at the end of the schedule."""
+    epsilon: float = 0.3
+    """Share of random actions at the start, equation (15)."""
+    epsilon_end: float = 0.1
+    epsilon_bonus: float = 0.2
+    """Added to epsilon at coverage 0, equation (13)."""
+    temperature: float = 2.0
+    """Gumbel-Softmax temperature at the start, equation (16)."""
+    temperature_end: float = 0.7
+    temperature_bonus: float = 0.5
+    """Added to the temperature at coverage 0, equation (14)."""
+    schedule_episodes: int = 1500
+    """Episodes over which learning rate, epsilon and temperature decay."""
+    coverage_signal: Literal["episode_so_far", "last_episode"] = "episode_so_far"
+    """c of (13) and (14): mean coverage of the episode so far, or of the last finished one."""
+    batch_size: int = 64
+    """Replayed steps in a gradient step, B."""
+    replay_capacity: int = 10_000
+    """Steps that the replay remembers."""
+    critic_weight: float = 0.1
+    """Weight of the critic's loss, equation (17)."""
+    kl_weight: float = 0.05
+    """Weight of the KL divergence, equation (17)."""
+    kl_reduction: Literal["sum", "mean"] = "sum"
+    """Equation (20) over the latent dimensions."""
+    messages: Literal["soft", "straight_through"] = "soft"
+    """Gumbel-Softmax samples as printed, or one-hot with the soft gradient."""
+    radius: float = 1.5
+    """Agents nearer than this share an edge, equation (4)."""
+    latent_size: int = 16
+    vocabulary: int = 8
+    """Symbols of a message."""
+    encoder_hidden: tuple[int, ...] = (64, 32)
+    message_hidden: int = 32
+    policy_hidden: tuple[int, int] = (64, 32)
+    critic_hidden: tuple[int, int] = (128, 64)
+
+    def __post_init__(self) -> None:
+        between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "epsilon", "epsilon_end")
+        between("algorithm", self, 0.0, 1.0, "epsilon_bonus")
+        require(
+            max(self.epsilon, self.epsilon_end) + self.epsilon_bonus <= 1.0,
+            "algorithm.epsilon plus algorithm.epsilon_bonus must not exceed 1, a probability",
+        )
+        between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
+        between("algorithm", self, 0.0, 100.0, "temperature_bonus", "critic_weight", "kl_weight")
+        between("algorithm", self, 0.0, 1e6, "radius")
+        between("algorithm", self, 1, 1_000_000, "batch_size", "replay_capacity", "schedule_episodes")
+        between("algorithm", self, 1, 100_000, "latent_size", "vocabulary", "message_hidden")
+        for name in ("encoder_hidden", "policy_hidden", "critic_hidden"):
+            sizes = getattr(self, name)
+            require(
+                len(sizes) > 0 and all(1 <= size <= 100_000 for size in sizes),
+                f"algorithm.{name} must be layer sizes between 1 and 100000, not {list(sizes)}",
+            )
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The agents' network: torso, memory and communication, the same choices for every algorithm."""
+
+    torso: Literal["mlp", "graph"] = "mlp"
+    """Layers over the observation vector, or a graph of the entities in sight by relative position."""
+    width: int = 128
+    """Units of a hidden layer."""
+    depth: int = 2
+    """Hidden layers of the mlp torso."""
+    recurrent: bool = False
+    """A GRU after the torso."""
+    latent: Literal["none", "deterministic", "vae"] = "none"
+    """A narrow code of what the agent sees, which its symbols are made of: none, a code, or a Gaussian."""
+    latent_size: int = 16
+    """Numbers of the code."""
+    communication: Literal["none", "commnet", "dial", "discrete", "soft"] = "none"
+    """CommNet's averages, DIAL's regularised units, or Gumbel-Softmax symbols: hard or soft."""
+    rounds: int = 1
+    """Rounds of messages within a step (CommNet, symbols)."""
+    vocabulary: int = 8
+    """Symbols of a message; units of a DIAL message."""
+    dial_noise: float = 2.0
+    """Standard deviation of the noise on DIAL's units while learning."""
+    radius: float = 1.5
+    """Agents nearer than this hear each other, where the task has positions."""
+    nearest_landmarks: int | None = None
+    """The graph torso looks at this many nearest landmarks; none: all in sight."""
+    nearest_agents: int | None = None
+    """And at this many nearest other agents; symbols are heard from as many."""
+    parameters: int | None = None
+    """Choose the width so that the acting network has about this many parameters; none: take the width."""
+
+    def __post_init__(self) -> None:
+        between("algorithm.network", self, 1, 65_536, "width", "vocabulary", "latent_size")
+        between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
+        between("algorithm.network", self, 1, 100, "depth", "rounds")
+        between("algorithm.network", self, 0.0, 100.0, "dial_noise")
+        between("algorithm.network", self, 0.0, 1e6, "radius")
+        between("algorithm.network", self, 1, 1_000_000_000, "parameters")
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """What every learner has: its network, its horizon, its step size, and the symmetry of the task."""
+
+    learns_code: ClassVar[bool] = False
+    """Whether there is a loss for the network's code."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    learning_rate: float = 1e-3
+    """Adam's step size at the start."""
+    learning_rate_end: float = 0.0
+    """And after the planned environment steps; linear in between."""
+    gamma: float = 0.95
+    """Discount of a step."""
+    n_step: int = 1
+    """Rewards in a target before it bootstraps (PPO: 0 leaves it to gae_lambda)."""
+    max_grad_norm: float = 10.0
+    """Longer gradients are shortened to this norm."""
+    augment: bool = False
+    """Turn what is learned from by a random one of the task's symmetries; a memory then starts empty."""
+    symmetric_play: bool = False
+    """Play greedily by the mean over the task's symmetries, eight for spread: eight times the messages."""
+    reward: Literal["team", "own"] = "team"
+    """Every agent earns the team's mean reward, or its own."""
+
+    def __post_init__(self) -> None:
+        between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "gamma")
+        between("algorithm", self, 0, 1_000, "n_step")
+        between("algorithm", self, 1e-6, 1e6, "max_grad_norm")
+        require(
+            not (self.symmetric_play and (self.network.recurrent or self.network.communication == "dial")),
+            "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network or DIAL",
+        )
+        require(
+            self.network.latent == "none" or self.learns_code,
+            "algorithm.network.latent needs a learner that trains the code, which gacrl does: leave it none",
+        )
+
+
+@dataclass(frozen=True)
+class PpoConfig(LearningConfig):
+    """Proximal policy optimisation of a team with shared weights; MAPPO and IPPO differ by the critic's view."""
+
+    n_step: int = 0
+    """Rewards in a target before it bootstraps; 0 leaves it to gae_lambda."""
+    gae_lambda: float = 0.95
+    """Of generalised advantage estimation."""
+    update_epochs: int = 6
+    """Passes over a rollout."""
+    num_minibatches: int = 2
+    """Gradient steps of a pass; a minibatch takes environments and times, never single agents."""
+    clip_eps: float = 0.2
+    """Bound of the policy's ratio around 1."""
+    ent_coef: float = 0.01
+    """Weight of the policy's entropy."""
+    ent_coef_end: float = 0.0
+    """And after the planned environment steps."""
+    vf_coef: float = 0.5
+    """Weight of the critic's loss."""
+    huber_delta: float = 10.0
+    """The critic's loss is linear beyond this error, in standard deviations of the returns."""
+    value_norm: bool = True
+    """The critic predicts returns in units of their running mean and standard deviation."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        between("algorithm", self, 0.0, 1.0, "gae_lambda")
+        between("algorithm", self, 1, 10_000, "update_epochs", "num_minibatches")
+        between("algorithm", self, 1e-6, 1e6, "clip_eps", "huber_delta")
+        between("algorithm", self, 0.0, 1e6, "ent_coef", "ent_coef_end", "vf_coef")
+
+
+@dataclass(frozen=True)
+class MappoConfig(PpoConfig):
+    """MAPPO (Yu et al. 2022): the critic sees the global state besides the agent's observation."""
+
+    name: ClassVar[str] = "mappo"
+
+
+@dataclass(frozen=True)
+class IppoConfig(PpoConfig):
+    """IPPO (de Witt et al. 2020): the critic sees what its agent sees."""
+
+    name: ClassVar[str] = "ippo"
+
+
+@dataclass(frozen=True)
+class QLearningConfig(LearningConfig):
+    """Q-learning of a team from replay."""
+
+    replay_capacity: int = 50_000
+    """Environment steps that the replay remembers."""
+    learning_starts: int = 1_000
+    """Environment steps before the first gradient step."""
+    batch_size: int = 128
+    """Windows of replayed steps in a gradient step."""
+    sequence_length: int = 1
+    """Steps learned from in a window; a recurrent network is unrolled over them."""
+    updates: int = 2
+    """Gradient steps after each rollout."""
+    target_step: float = 0.01
+    """The target network moves this far towards the online one after each gradient step."""
+    reward_norm: bool = False
+    """Learn from rewards in units of their running mean and standard deviation, which keeps values around 0 (a
+    monotonic mixer's units saturate far below it). Leaves the optimum where episodes have a fixed length."""
+    double_q: bool = True
+    """The online network chooses the action that the target network values."""
+    averaged: bool = False
+    """Play greedily with the target network, a running mean of the parameters."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.n_step >= 1, "algorithm.n_step must be at least 1 where there is no gae_lambda")
+        between("algorithm", self, 1, 10_000_000, "replay_capacity", "batch_size", "sequence_length")
+        between("algorithm", self, 0, 1_000_000_000, "learning_starts")
+        between("algorithm", self, 1, 1_000_000, "updates")
+        between("algorithm", self, 0.0, 1.0, "target_step")
+
+
+@dataclass(frozen=True)
+class QmixConfig(QLearningConfig):
+    """QMIX, and with other mixers VDN and IQL."""
+
+    name: ClassVar[str] = "qmix"
+
+    mixer: Literal["qmix", "vdn", "iql"] = "qmix"
+    """A monotonic network of the agents' values, their sum, or each for itself."""
+    mixer_width: int = 32
+    """Units of QMIX's mixing network."""
+    epsilon: float = 1.0
+    """Share of random actions at the start."""
+    epsilon_end: float = 0.05
+    epsilon_steps: int = 50_000
+    """Environment steps over which the share falls."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        between("algorithm", self, 1, 10_000, "mixer_width")
+        between("algorithm", self, 0, 1_000_000_000, "epsilon_steps")
+        between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end")
+
+
+@dataclass(frozen=True)
+class GacrlConfig(QLearningConfig):
+    """GACRL that solves the task: the paper's four ideas on a learner that uses them (docs/algorithm.md)."""
+
+    name: ClassVar[str] = "gacrl"
+    learns_code: ClassVar[bool] = True
+
+    critic: Literal["central", "sum"] = "central"
+    """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""
+    latent_weight: float = 1e-3
+    """Weight of the code's loss: reconstruction and KL divergence."""
+    exploration: Literal["adaptive", "linear", "fixed", "yoked"] = "adaptive"
+    """The level of exploration follows the coverage that greedy episodes reach, or time, or stays at its end, or
+    follows the coverage of another training."""
+    yoked_coverage: tuple[float, ...] = ()
+    """That coverage, at even spaces over the planned environment steps."""
+    epsilon: float = 1.0
+    """Share of random actions while nothing is covered."""
+    epsilon_end: float = 0.05
+    """And when everything is."""
+    temperature: float = 2.0
+    """Gumbel-Softmax temperature of the symbols while nothing is covered."""
+    temperature_end: float = 0.5
+    """And when everything is."""
+    exploration_steps: int = 12_000
+    """Environment steps over which the levels fall, where they follow time."""
+    greedy_share: float = 0.2
+    """Share of the training episodes that are played greedily, to see what is covered without exploring."""
+    coverage_radius: Literal["0.1", "0.2", "0.5"] = "0.2"
+    """Radius of the coverage that exploration follows."""
+    averaged: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        between("algorithm", self, 0.0, 1e6, "latent_weight")
+        between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
+        between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
+        between("algorithm", self, 1, 1_000_000_000, "exploration_steps")
+        require(
+            all(0.0 <= coverage <= 1.0 for coverage in self.yoked_coverage),
+            "algorithm.yoked_coverage must be shares between 0 and 1",
+        )
+        require(
+            self.exploration != "yoked" or len(self.yoked_coverage) > 0,
+            "algorithm.exploration yoked needs the coverage to follow, in algorithm.yoked_coverage",
+        )
+
+
+AlgorithmConfig: TypeAlias = GacrlPaperConfig | GacrlConfig | MappoConfig | IppoConfig | QmixConfig
+"""Any algorithm's settings."""
+
+ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType(
+    {kind.name: kind for kind in (GacrlPaperConfig, GacrlConfig, MappoConfig, IppoConfig, QmixConfig)}
+)

@@ -1,0 +1,127 @@
+"""How the settings of a run load and save: to and from plain data, with an error that names what is wrong."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from gacrl.config.algorithms import ALGORITHMS
+from gacrl.config.checks import require, unknown
+from gacrl.config.presets import DEFAULT_PRESET, preset
+from gacrl.config.run import RunConfig
+from gacrl.errors import ConfigError, reason
+
+
+def to_dict(config: RunConfig) -> dict[str, Any]:
+    """The settings as plain data, complete; the algorithm's name stands among its settings."""
+    data = dataclasses.asdict(config)
+    return {**data, "algorithm": {"name": config.algorithm.name, **data["algorithm"]}}
+
+
+def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConfig:
+    """Settings from plain data over a base (the preset that the data names, else the default one).
+
+    Raises ConfigError for an unknown key (with the nearest known one) or a value of the wrong type.
+    """
+    named = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
+    base = named if base is None else base
+    data = dict(data)
+    if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
+        settings = dict(data["algorithm"])
+        name = _text(settings.pop("name"), "algorithm.name")
+        if name not in ALGORITHMS:
+            raise ConfigError(unknown("algorithm", name, ALGORITHMS))
+        if name != base.algorithm.name:
+            base = replace(base, algorithm=ALGORITHMS[name]())
+        data["algorithm"] = settings
+    return _merge(base, data, "")
+
+
+def load(path: Path, base: RunConfig | None = None) -> RunConfig:
+    """Read settings from a JSON file (as `config.json` of a run folder, or a part of it) over a base.
+
+    Without a base: over the preset that the file names. Raises ConfigError.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        mend = "`gacrl config` prints one to start from"
+        raise ConfigError(f"cannot read the configuration {path}: {reason(error)}; {mend}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} must hold a JSON object of settings")
+    try:
+        return from_dict(data, base)  # pyright: ignore[reportUnknownArgumentType]
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def dumps(config: RunConfig) -> str:
+    """The settings as the text of a loadable file."""
+    return json.dumps(to_dict(config), indent=2) + "\n"
+
+
+def fingerprint(settings: RunConfig | Mapping[str, Any]) -> str:
+    """A hash of every setting but the run's length, which may be extended: what a checkpoint belongs to.
+
+    Of plain data: of the settings that stand in it, whatever further ones there are by now, so that a run made before
+    a setting was added can still go on.
+    """
+    plain = to_dict(settings) if isinstance(settings, RunConfig) else settings
+    data = {**plain, "training": {k: v for k, v in plain.get("training", {}).items() if k != "env_steps"}}
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str):
+        raise ConfigError(f"{where} must be a name, not {value!r}")
+    return value
+
+
+def _merge(settings: Any, data: Mapping[str, Any], where: str) -> Any:
+    """`settings`, a dataclass, with the values that `data` names."""
+    hints = get_type_hints(type(settings))
+    fields = {f.name for f in dataclasses.fields(settings)}
+    changes: dict[str, Any] = {}
+    for key, value in data.items():
+        if key not in fields:
+            raise ConfigError(unknown("setting", where + key, {where + name for name in fields}))
+        current = getattr(settings, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{where}{key} must be an object of settings, not {value!r}")
+            changes[key] = _merge(current, value, f"{where}{key}.")  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            changes[key] = _coerce(value, hints[key], where + key)
+    return replace(settings, **changes)
+
+
+def _coerce(value: Any, hint: Any, where: str) -> Any:
+    """The value as the type that the setting has; JSON has no tuples, and writes 1 for 1.0."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        require(value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+        return value
+    if origin is tuple and isinstance(value, list | tuple):
+        inner = arguments[0]
+        values: list[Any] = list(value)  # pyright: ignore[reportUnknownArgumentType]
+        fixed = arguments[-1] is not Ellipsis
+        require(
+            not fixed or len(values) == len(arguments),
+            f"{where} must be {len(arguments)} numbers, not {values!r}",
+        )
+        return tuple(_coerce(item, inner, where) for item in values)
+    if origin is not None and type(None) in arguments:  # X | None
+        return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(str(value))  # infinity where it is too large
+    if origin is tuple:
+        raise ConfigError(f"{where} must be a list, not {value!r}")
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
+    matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+    require(matches, f"{where} must be {wanted}, not {value!r}")
+    return value

@@ -1,0 +1,180 @@
+"""A run that has ended, as its files tell it, and whether it may stand beside another.
+
+Every run reports its return in one convention (MPE2's reward at its default local ratio, the mean over agents, summed
+over the episode), whatever it learned from, so that there is nothing to convert; returns of other horizons have no
+exact conversion, and are refused.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+from gacrl.config import files as configuration
+from gacrl.config.run import RunConfig
+from gacrl.errors import UserError, reason
+from gacrl.training.recorder import RunFolder
+
+Play = Literal["greedy", "sampled"]
+Warn = Callable[[str], None]
+
+_TASK = (
+    *("env.name", "env.num_agents", "env.num_landmarks", "env.arena_scale", "env.landmark_speed"),
+    *("env.terminate_on_success", "env.reset_on_collision", "env.reset_distance"),
+)
+"""Settings that make another task, in which every number means something else."""
+_MEASURED_WITH = {
+    "reward_shaped": (
+        *("env.local_ratio", "env.coverage_threshold"),
+        *("env.collision_term", "env.collision_distance"),
+    ),
+    "coverage_mean_theta": ("env.coverage_threshold",),
+}
+"""Metrics that are defined by settings."""
+
+
+class Finished(NamedTuple):
+    """A run folder, read."""
+
+    path: Path
+    config: RunConfig
+    settings: dict[str, Any]
+    """The same under dotted names."""
+    summary: dict[str, Any]
+    rows: list[dict[str, Any]]
+    """Of `metrics.jsonl`: an evaluation of a seed each."""
+
+
+def load(path: Path, warn: Warn) -> Finished:
+    """A run that has ended. Raises UserError where it has not, or where one of its files is damaged."""
+    folder = RunFolder.open(path)
+    config = folder.config()
+    if not folder.summary_file.exists():
+        raise UserError(f"{path} has not ended, and has no summary.json: `gacrl resume {path}` ends it")
+    try:
+        summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
+        shape = {"final": dict, "references": dict, "episodes": int, "horizon": int, "seeds": list}
+        if not all(isinstance(summary[name], kind) for name, kind in shape.items()):
+            raise ValueError("it lacks what a run's summary has")
+        if not all(isinstance(summary["final"].get(play), dict) for play in get_args(Play)):
+            raise ValueError("it lacks a closing evaluation")
+        planned = config.num_updates * config.steps_per_update
+        if summary.get("env_steps", planned) != planned:
+            raise UserError(
+                f"{path} has trained {summary['env_steps']} of {planned} environment steps, and was measured then: "
+                f"`gacrl resume {path}` ends it"
+            )
+        if summary["seeds"] != list(config.seeds):
+            raise ValueError(f"it is of seeds {summary['seeds']}, config.json of {list(config.seeds)}")
+        rows = folder.metrics()
+        lines = len(folder.metrics_file.read_text(encoding="utf-8").splitlines())
+    except OSError as error:
+        raise UserError(f"cannot read {error.filename}: {reason(error)}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"a file of {path} is damaged, it is not text: {error}") from error
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise UserError(f"{folder.summary_file} is damaged: {error}") from error
+    if lines > len(rows):
+        warn(f"the last line of {folder.metrics_file}, line {lines}, is cut off: compared without it")
+    return Finished(path, config, flat(configuration.to_dict(config)), summary, rows)
+
+
+def require_same_task(runs: Sequence[Finished]) -> None:
+    """Raises UserError, naming two of them, for runs of different tasks, horizons or versions of MPE2."""
+    first = runs[0]
+    for run in runs[1:]:
+        horizons = first.summary["horizon"], run.summary["horizon"]
+        if horizons[0] != horizons[1]:
+            raise UserError(
+                f"{first.path} was evaluated over {horizons[0]} steps, {run.path} over {horizons[1]}, and returns "
+                "of one are not to be had from the other: train with the same --evaluation.horizon"
+            )
+        for name in _TASK:
+            ours, theirs = _task_setting(first, name), _task_setting(run, name)
+            if ours != theirs:
+                raise UserError(
+                    f"{first.path} and {run.path} are different tasks, {name} is {ours} in one and {theirs} in "
+                    "the other: compare runs of one task"
+                )
+        versions = [r.summary.get("versions", {}).get("mpe2") for r in (first, run)]
+        if versions[0] != versions[1]:
+            raise UserError(
+                f"{first.path} was measured with MPE2 {versions[0]}, {run.path} with {versions[1]}: "
+                "compare runs of one version of the environment"
+            )
+
+
+def _task_setting(run: Finished, name: str) -> Any:
+    env = run.config.env
+    if name == "env.num_landmarks":
+        return env.landmarks  # as many as agents, or said so
+    if name == "env.reset_distance" and env.reset_on_collision == "off":
+        return None
+    return run.settings[name]
+
+
+def require_same_meaning(runs: Sequence[Finished], metric: str) -> None:
+    """Raises UserError for a metric that settings define, where these differ."""
+    for name in _MEASURED_WITH.get(metric.removeprefix("score_"), ()):
+        for run in runs[1:]:
+            ours, theirs = runs[0].settings[name], run.settings[name]
+            if ours != theirs:
+                raise UserError(
+                    f"{metric} is measured with {name}, which is {ours} in {runs[0].path} and {theirs} in "
+                    f"{run.path}: compare another metric"
+                )
+
+
+def closing_value(run: Finished, play: Play, metric: str, member: int) -> float:
+    """Of the closing evaluation. Raises UserError where it is missing or no number."""
+    try:
+        value = float(run.summary["final"][play][metric]["values"][member])
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise UserError(
+            f"{run.path / 'summary.json'} has no {play} {metric} of seed {run.config.seeds[member]}"
+        ) from error
+    if not math.isfinite(value):
+        raise UserError(
+            f"{run.path / 'summary.json'} has {value} as {metric} of seed {run.config.seeds[member]}: "
+            "leave this run out, or compare another metric"
+        )
+    return value
+
+
+def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -> dict[int, dict[str, float]]:
+    """The metrics of one seed's evaluations under the environment steps at which they took place.
+
+    Raises UserError, naming the line, for one that is not an evaluation, or holds what is no number.
+    """
+    found: dict[int, dict[str, float]] = {}
+    for number, row in enumerate(run.rows, start=1):
+        where = f"line {number} of {run.path / 'metrics.jsonl'}"
+        try:
+            if row["seed"] != seed:
+                continue
+            values = {metric: on_scale(row[play], run.summary["references"], metric) for metric in metrics}
+            found[int(row["env_steps"])] = values
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{where} is not an evaluation with {play} {', '.join(metrics)}") from error
+        for metric, value in values.items():
+            if not math.isfinite(value):
+                raise UserError(f"{where} has {value} as {metric}: leave this run out, or compare another metric")
+    return found
+
+
+def on_scale(values: Mapping[str, Any], references: Mapping[str, Any], metric: str) -> float:
+    """A metric among those of an evaluation; a score is made there, from what random and oracle got."""
+    if metric in values or not metric.startswith("score_"):
+        return float(values[metric])
+    name = metric.removeprefix("score_")
+    low, high = float(references["random"][name]), float(references["oracle"][name])
+    return (float(values[name]) - low) / (high - low)
+
+
+def flat(data: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Nested settings under dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in data.items():
+        found.update(flat(value, f"{where}{name}.") if isinstance(value, Mapping) else {where + name: value})
+    return found

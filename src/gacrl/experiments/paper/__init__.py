@@ -1,0 +1,1 @@
+"""The paper's experiment: its runs, tables, claims and grid search."""

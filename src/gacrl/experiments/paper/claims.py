@@ -1,0 +1,156 @@
+"""The claims of the paper, and the readings under which each of them is judged (in `comparisons`).
+
+The claims, the readings under which each is repeated, and the paper's numbers are data: `claims.json` and
+`paper.json`. No verdict is written there. A reading changes one thing at a time: what a column of the tables
+means, which episodes count, or which reward the algorithms were trained on.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
+from typing import Any, Literal, TypeAlias
+
+from gacrl.experiments.paper.evidence import FINAL_EPISODES, Play
+
+Verdict: TypeAlias = Literal[
+    "holds",
+    "does not hold",
+    "cannot be told apart from random",
+    "cannot be decided with these seeds",
+    "not reproducible",
+    "not tested here",
+]
+HOLDS: Verdict = "holds"
+FAILS: Verdict = "does not hold"
+AS_RANDOM: Verdict = "cannot be told apart from random"
+OPEN: Verdict = "cannot be decided with these seeds"
+IRREPRODUCIBLE: Verdict = "not reproducible"
+UNTESTED: Verdict = "not tested here"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What a column of the paper's tables is read as: a weighted sum of our metrics."""
+
+    label: str
+    says: str
+    weights: Mapping[str, float]
+    better: Literal["higher", "lower"]
+    printed: str
+    """The column of the paper's tables."""
+
+    @property
+    def sign(self) -> float:
+        """What makes more of it better."""
+        return 1.0 if self.better == "higher" else -1.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the paper; the defaults are those of docs/algorithm.md."""
+
+    play: Play = "training"
+    column: str = "paper"
+    row: Literal["episode", "stretch"] = "episode"
+    """A row of Table II is one episode, or the mean of the 50 before it."""
+    swap: tuple[str, str] | None = None
+    """A measure, and the one that takes its place."""
+
+    def measure(self, name: str) -> Measure:
+        """The measure of that name, or its substitute."""
+        return measures()[self.swap[1] if self.swap and self.swap[0] == name else name]
+
+    def describe(self) -> str:
+        """What this reading changes."""
+        said = {
+            "sampled": "closing evaluation, sampled as in training",
+            "greedy": "closing evaluation, greedy",
+        }.get(self.play, "")
+        if self.column == "mpe2":
+            said = "all trained on MPE2's own reward, no curriculum"
+        if self.column == "mixed":
+            said = "the baselines trained on MPE2's own reward, GACRL on the paper's; closing evaluation, sampled"
+        if self.row == "stretch":
+            said = f"a row is the mean of {FINAL_EPISODES} episodes"
+        if self.swap:
+            old, new = (measures()[name] for name in self.swap)
+            said = f"{old.label}: {new.says}"
+        return said or "as docs/algorithm.md reads it"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence or row of the paper, and how it is tested."""
+
+    id: str
+    section: str
+    quote: str
+    kind: str
+    settings: Mapping[str, Any]
+    """What the kind needs, as in `claims.json`."""
+    readings: tuple[Reading, ...]
+    """The alternatives under which it is repeated."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A verdict under one reading, and the numbers that decide."""
+
+    verdict: Verdict
+    because: str
+    reading: Reading = Reading()
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim under every reading."""
+
+    claim: Claim
+    base: Outcome
+    alternatives: tuple[Outcome, ...]
+    in_print: str
+    """What the paper's own tables say of it; empty where they do not."""
+
+    @property
+    def hangs_on(self) -> tuple[Outcome, ...]:
+        """The readings that change the verdict."""
+        return tuple(outcome for outcome in self.alternatives if outcome.verdict != self.base.verdict)
+
+
+@cache
+def _data() -> dict[str, Any]:
+    return json.loads(
+        resources.files("gacrl.experiments.paper").joinpath("claims.json").read_text(encoding="utf-8")
+    )
+
+
+@cache
+def measures() -> dict[str, Measure]:
+    """The readings of the tables' columns."""
+    return {name: Measure(**entry) for name, entry in _data()["measures"].items()}
+
+
+@cache
+def claims() -> tuple[Claim, ...]:
+    """Every claim, in the paper's order."""
+    return tuple(_claim(entry) for entry in _data()["claims"])
+
+
+def untrained() -> list[dict[str, str]]:
+    """The readings that would need other training: {place, setting}."""
+    return _data()["untrained"]
+
+
+def _claim(entry: dict[str, Any]) -> Claim:
+    own = ("id", "section", "quote", "kind", "repeat")
+    settings = {name: value for name, value in entry.items() if name not in own}
+    readings = [_reading(change) for repeat in entry["repeat"] for change in _data()["alternatives"][repeat]]
+    return Claim(entry["id"], entry["section"], entry["quote"], entry["kind"], settings, tuple(readings))
+
+
+def _reading(change: Mapping[str, Any]) -> Reading:
+    old, new = change.get("swap", ("", ""))
+    reading = Reading(swap=(old, new) if old else None)
+    return replace(reading, **{name: value for name, value in change.items() if name != "swap"})

@@ -1,0 +1,258 @@
+"""Policies that learn nothing: two floors, `random` and `noop`, a ceiling, `oracle`, and `local`, which sees little.
+
+The oracle reads the exact state, whatever the agents themselves observe. It assigns agents to landmarks once
+per episode, at the least total squared distance. Then each agent takes the push after which it would coast
+nearest to its target, where crowding another agent counts as distance. Targets leave room for two discs;
+landmarks need not. It is a strong heuristic and no optimum: a learned policy may beat it.
+
+The local one moves as the oracle does, but matches only what it has in sight, nearest pairs first, and anew in every
+step: what can be had in a large team without a view of the whole and without a word.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.envs.particles import DIRECTIONS, Physics, pairwise_offsets
+from gacrl.tasks.spread.assignment import assign
+from gacrl.tasks.spread.environment import CAPTURE_RADIUS, Spread, SpreadParams, SpreadState, reflect, unpack_state
+from gacrl.types import Channel, Decision, Memory, Observation, Policy, PRNGKey
+
+SCRIPTED = ("random", "noop", "oracle")
+"""Stand beside every number."""
+PLAYABLE = (*SCRIPTED, "local")
+SIGHT = 5
+"""The local policy sees this many nearest landmarks, and as many nearest agents."""
+
+UNASSIGNED = -2
+"""The oracle's memory before an episode's first step; -1 is `assign`'s mark of an agent without landmark."""
+SHARED_DISTANCE = 0.17
+"""Landmarks this close get one agent, midway: it covers both, where two agents would push each other off."""
+SHIFT = 0.95 * CAPTURE_RADIUS
+"""How far a target may move off its landmark and still be sure to cover it."""
+ELBOW_ROOM = 0.02
+"""Agents keep this far apart, disc to disc, unless it costs them as much in distance to their targets."""
+
+
+class Scripted(NamedTuple):
+    """A policy, and its memory at an episode's start, both for one environment."""
+
+    policy: Policy
+    initial_memory: Memory
+
+
+def make(name: str, env: Spread) -> Scripted:
+    """The scripted policy of that name for this task; ValueError for a name that is not in `PLAYABLE`.
+
+    The oracle takes physics and arena scale, which no observation tells, from `env.initial_params`; masks,
+    places and velocities of agents and landmarks it reads from the observation.
+    """
+    if name not in PLAYABLE:
+        raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(PLAYABLE)}.")
+    return {"random": _random, "noop": _noop, "oracle": _oracle, "local": _local}[name](env)
+
+
+def _random(env: Spread) -> Scripted:
+    """Every action of the action space is equally likely."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        shape = (env.num_agents, env.num_actions)
+        if env.continuous_actions:
+            return Decision(jax.random.uniform(key, shape)), memory
+        return Decision(jax.random.randint(key, shape[:1], 0, env.num_actions)), memory
+
+    return Scripted(policy, ())
+
+
+def _noop(env: Spread) -> Scripted:
+    """Nobody ever pushes."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        return Decision(_as_action(jnp.zeros((env.num_agents, 2)), env.continuous_actions)), memory
+
+    return Scripted(policy, ())
+
+
+def _oracle(env: Spread) -> Scripted:
+    """Memory: each agent's landmark [N], fixed from the episode's first step on."""
+    params = env.initial_params
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if observation.state is None:
+            raise ValueError("The oracle needs an environment that puts its state into the observation.")
+        state = unpack_state(observation.state, env.num_agents)
+        agents, motion = observation.agent_mask, state.landmark_velocities
+        posts, wanted = _posts(state, observation.landmark_mask)
+
+        def assign_agents(memory: Int[Array, " N"]) -> Int[Array, " N"]:
+            origins = state.positions[:, None]
+            meeting = jax.vmap(_intercept, (0, None, None, None))(origins, posts, motion, params)
+            squares = jnp.square(_length(meeting - origins))
+            possible = (agents & (memory == UNASSIGNED))[:, None] & wanted[None, :]
+            return assign(jnp.where(possible, squares, jnp.inf))
+
+        # A loop that runs once at most: mapped over environments, `cond` would assign in every step and select.
+        # The body depends on the memory, because XLA moves constant work out, in front of the loop.
+        landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
+
+        free = ~(agents & (landmark >= 0) & wanted[landmark])
+        coasting, _ = _coast(state, params.physics)
+        target = _intercept(coasting, posts[landmark], motion[landmark], params)
+        return Decision(_steer(env, state, agents, target, free)), landmark
+
+    return Scripted(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
+
+
+def _local(env: Spread) -> Scripted:
+    """Each agent decides anew in every step, from the nearest landmarks and agents alone."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if observation.state is None:
+            raise ValueError("The local policy needs an environment that puts its state into the observation.")
+        state = unpack_state(observation.state, env.num_agents)
+        agents = observation.agent_mask
+        _, distance = pairwise_offsets(state.positions, state.landmarks)
+        distance = jnp.where(observation.landmark_mask, distance, jnp.inf)
+        _, between = pairwise_offsets(state.positions, state.positions)
+        between = jnp.where(_pairs(agents), between, jnp.inf)
+        nearest = lax.top_k(-distance, min(SIGHT, env.num_landmarks))[1]  # [N K]
+        others = lax.top_k(-between, min(SIGHT, env.num_agents - 1))[1]
+        there = jnp.take_along_axis(between, others, axis=1) < jnp.inf
+        group = jnp.concatenate([jnp.arange(env.num_agents)[:, None], others], axis=1)  # [N M], itself first
+        theirs = distance[group[:, :, None], nearest[:, None, :]]  # [N M K]
+        hidden = jnp.concatenate([jnp.zeros((env.num_agents, 1), bool), ~there], axis=1)
+        choice = jax.vmap(_greedy_match)(jnp.where(hidden[..., None], jnp.inf, theirs))
+        target = state.landmarks[jnp.take_along_axis(nearest, choice[:, None], axis=1)[:, 0]]
+        return Decision(_steer(env, state, agents, target, ~agents)), memory
+
+    return Scripted(policy, ())
+
+
+def _greedy_match(distance: Float[Array, "M K"]) -> Int[Array, ""]:
+    """The landmark of the first agent when the closest pair is matched first, and so on.
+
+    Where it is left without one: the last, the farthest in sight, away from the crowd.
+    """
+    num_landmarks = distance.shape[1]
+
+    def match(_: Int[Array, ""], loop: tuple[Array, Array]) -> tuple[Array, Array]:
+        left, mine = loop
+        agent, landmark = jnp.divmod(left.argmin(), num_landmarks)
+        mine = jnp.where((agent == 0) & (left[agent, landmark] < jnp.inf), landmark, mine)
+        return left.at[agent].set(jnp.inf).at[:, landmark].set(jnp.inf), mine
+
+    start = distance, jnp.asarray(num_landmarks - 1)
+    return lax.fori_loop(0, min(distance.shape), match, start)[1]
+
+
+def _steer(
+    env: Spread,
+    state: SpreadState,
+    agents: Bool[Array, " N"],
+    target: Float[Array, "N 2"],
+    free: Bool[Array, " N"],
+) -> Array:
+    """The actions that bring agents to their targets, out of each other's way; `free` ones stay where they like."""
+    physics = env.initial_params.physics
+    coasting, reach = _coast(state, physics)
+    target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
+    pushes = _pushes((target - coasting) / reach, env.continuous_actions)
+    outcomes = coasting[:, None] + reach * pushes
+    distance = _length(outcomes - target[:, None])
+    # The others are expected halfway between coasting on and what each would do if it were alone.
+    expected = (coasting + _row_choice(outcomes, distance.argmin(axis=1))) / 2
+    choice = (distance + _crowding(outcomes, expected, agents, physics)).argmin(axis=1)
+    return _as_action(_row_choice(pushes, choice), env.continuous_actions)
+
+
+def _posts(state: SpreadState, landmark_mask: Bool[Array, " L"]) -> tuple[Float[Array, "L 2"], Bool[Array, " L"]]:
+    """Where to stand to cover each landmark, and which landmarks want an agent of their own.
+
+    Two landmarks that are each other's nearest share a post midway if they are close and stay together:
+    what they drift apart in one unit of time (ten steps) adds to their distance. One of them wants the agent.
+    """
+    index = jnp.arange(state.landmarks.shape[0])
+    _, distance = pairwise_offsets(state.landmarks, state.landmarks)
+    _, drift = pairwise_offsets(state.landmark_velocities, state.landmark_velocities)
+    apart = jnp.where(_pairs(landmark_mask), distance + drift, jnp.inf)
+    partner = apart.argmin(axis=1)
+    shared = (partner[partner] == index) & (apart.min(axis=1) < SHARED_DISTANCE)
+    midway = (state.landmarks + state.landmarks[partner]) / 2
+    wanted = landmark_mask & ~(shared & (partner < index))
+    return jnp.where(shared[:, None], midway, state.landmarks), wanted
+
+
+def _intercept(
+    start: Float[Array, "#M 2"], posts: Float[Array, "M 2"], motion: Float[Array, "M 2"], params: SpreadParams
+) -> Float[Array, "M 2"]:
+    """Where agents at top speed meet their moving posts, no sooner than `_coast` looks ahead."""
+    meeting = posts
+    for _ in range(2):  # time from place, place from time, and once more
+        time = _length(meeting - start) / params.physics.top_speed + 3 * params.physics.time_step
+        meeting, _ = reflect(posts + time[:, None] * motion, motion, params.arena_scale)
+    return meeting
+
+
+def _make_room(
+    targets: Float[Array, "N 2"], free: Bool[Array, " N"], agent_mask: Bool[Array, " N"], physics: Physics
+) -> Float[Array, "N 2"]:
+    """Pushes targets apart that two agents could not stand on: by up to SHIFT, by any length where free."""
+    offsets, distance = pairwise_offsets(targets, targets)
+    room = 2 * (physics.agent_radius + physics.contact_margin)
+    overlap = jnp.where(_pairs(agent_mask), jnp.maximum(room - distance, 0.0), 0.0)
+    shift = -(offsets * (overlap / 2 / jnp.maximum(distance, 1e-6))[..., None]).sum(1)
+    length = jnp.maximum(_length(shift), 1e-6)
+    return targets + shift * jnp.minimum(1.0, jnp.where(free, jnp.inf, SHIFT) / length)[:, None]
+
+
+def _coast(state: SpreadState, physics: Physics) -> tuple[Float[Array, "N 2"], Float[Array, ""] | float]:
+    """Positions three steps ahead without any push, and how far one of full force, now, moves them.
+
+    A push changes the velocity after the first step; in the third, damping has taken its share.
+    """
+    kept, dt = 1 - physics.damping, physics.time_step
+    effect = dt * (1 + kept)
+    return state.positions + (dt + effect * kept) * state.velocities, effect * dt * physics.action_force
+
+
+def _pushes(exact: Float[Array, "N 2"], continuous: bool) -> Float[Array, "N C 2"]:
+    """Each agent's candidates, in units of the full force: the directions, and the exact push if it may."""
+    directions = jnp.broadcast_to(jnp.asarray(DIRECTIONS), (exact.shape[0], len(DIRECTIONS), 2))
+    if not continuous:
+        return directions
+    return jnp.concatenate([directions, jnp.clip(exact, -1.0, 1.0)[:, None]], axis=1)
+
+
+def _crowding(
+    places: Float[Array, "N C 2"],
+    others: Float[Array, "N 2"],
+    agent_mask: Bool[Array, " N"],
+    physics: Physics,
+) -> Float[Array, "N C"]:
+    """How far each place is inside the discs and the elbow room of the other agents, summed over them."""
+    distance = _length(places[:, :, None] - others[None, None])
+    depth = jnp.maximum(2 * physics.agent_radius + ELBOW_ROOM - distance, 0.0)
+    return jnp.where(_pairs(agent_mask)[:, None], depth, 0.0).sum(-1)
+
+
+def _as_action(push: Float[Array, "N 2"], continuous: bool) -> Int[Array, " N"] | Float[Array, "N 5"]:
+    """The action whose force is the push, in units of the full force; the nearest one if discrete."""
+    along = push @ jnp.asarray(DIRECTIONS).T
+    return jnp.maximum(along, 0.0) if continuous else along.argmax(axis=1)
+
+
+def _pairs(mask: Bool[Array, " M"]) -> Bool[Array, "M M"]:
+    """Which entries are two different real ones."""
+    return mask[:, None] & mask[None, :] & ~jnp.eye(mask.shape[0], dtype=bool)
+
+
+def _row_choice(options: Float[Array, "N C 2"], choice: Int[Array, " N"]) -> Float[Array, "N 2"]:
+    return jnp.take_along_axis(options, choice[:, None, None], axis=1)[:, 0]
+
+
+def _length(vectors: Float[Array, "*b 2"]) -> Float[Array, "*b"]:
+    """Written out, because XLA does not vectorise a sum over so short an axis on CPUs (50 times slower)."""
+    return jnp.sqrt(jnp.square(vectors[..., 0]) + jnp.square(vectors[..., 1]))
