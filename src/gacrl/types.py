@@ -13,22 +13,25 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 PRNGKey: TypeAlias = Key[Array, ""]
 Memory: TypeAlias = Any
-"""A pytree: what a policy carries from step to step: `()` when feed-forward, a recurrent carry otherwise."""
+"""A pytree that a policy carries from step to step: `()` when feed-forward, a recurrent carry otherwise.
+
+Its arrays have the agents in front; a scalar belongs to the whole team."""
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Named scalars of one step or one update."""
 
 
 class Observation(NamedTuple):
-    """What one environment shows its agents before they act.
+    """What one environment shows its agents before they act; `gacrl.envs.environment.observe` fills the masks.
 
-    Padded agents and landmarks are False in their mask: they never send, count or earn.
+    Absent agents and landmarks are False in their mask: they never send, count or earn.
     """
 
     features: Float[Array, "*b N O"]
     positions: Float[Array, "*b N 2"] | None
     """Where the agents are, for graphs over distance; None where the task has no space."""
     agent_mask: Bool[Array, "*b N"]
-    landmark_mask: Bool[Array, "*b L"]
+    landmark_mask: Bool[Array, "*b L"] | None
+    """None where the task has no landmarks, or where all are always there."""
     action_mask: Bool[Array, "*b N A"]
     adjacency: Bool[Array, "*b N N"] | None = None
     """A graph that the task itself prescribes; None leaves it to the algorithm."""
@@ -37,14 +40,25 @@ class Observation(NamedTuple):
 
 
 class Entities(NamedTuple):
-    """What an agent sees, taken apart into the things it sees: for networks over graphs of entities."""
+    """What an agent sees, taken apart into the things it sees: for networks over graphs of entities.
+
+    Landmarks are places and things, agents are the other ones. Features tell apart what stands at the same place.
+    """
 
     own: Float[Array, "*b N K"]
     """About the agent itself, nothing that depends on where the origin lies."""
     landmarks: Float[Array, "*b N L 2"]
-    """From the agent to each landmark in sight; (0, 0) is padding."""
+    """From the agent to each landmark."""
     agents: Float[Array, "*b N M 2"]
-    """From the agent to each other agent in sight; (0, 0) is padding."""
+    """From the agent to each other agent."""
+    landmark_mask: Bool[Array, "*b N L"]
+    """Which of the landmarks are in sight."""
+    agent_mask: Bool[Array, "*b N M"]
+    """Which of the other agents are in sight."""
+    landmark_features: Float[Array, "*b N L F"] | None = None
+    """What is known of each landmark besides: its colour, or that it is marked."""
+    agent_features: Float[Array, "*b N M G"] | None = None
+    """What is known of each other agent besides."""
 
 
 class Decision(NamedTuple):
@@ -75,7 +89,9 @@ class Transition(NamedTuple):
     """This step opened an episode; the policy's memory was fresh."""
     next_observation: Observation
     info: Metrics
-    """The task's measurements after the step (names: `gacrl.evaluation.metrics`)."""
+    """The task's measurements after the step; `reward_raw` is always among them."""
+    left: Bool[Array, "*b N"] | None = None
+    """This agent's life ended with the step: nothing that follows in its slot is its own. None: lives are episodes."""
 
 
 class Rollout(NamedTuple):
@@ -104,6 +120,14 @@ class Channel(NamedTuple):
 
 Policy: TypeAlias = Callable[[Memory, Observation, PRNGKey, Channel], tuple[Decision, Memory]]
 """(memory, observation, key, channel) -> (decision, memory), for one environment. Everything that acts uses it."""
+
+
+class Actor(NamedTuple):
+    """A policy that learns nothing, and its memory at an episode's start, both for one environment."""
+
+    policy: Policy
+    initial_memory: Memory
+
 
 Learner: TypeAlias = Any
 """Parameters, optimiser, replay, exploration, hyper: a pytree that only its algorithm looks into."""

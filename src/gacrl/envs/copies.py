@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
-from gacrl.envs.environment import BatchEnvironment, Environment, EnvParams, EnvState, TimeStep
+from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
 from gacrl.types import Observation, PRNGKey
 
 Keys: TypeAlias = Key[Array, " E"]
@@ -30,36 +30,32 @@ def step(
     Where an episode has ended the first two are those of a new one; the third holds the last observation of the old.
     """
     num_envs = action.shape[0]
-    state, after = act(env, params, state, action, jax.random.split(key, num_envs))
+    state, after = env.step_many(state, action, jax.random.split(key, num_envs), params)
 
     def reset_keys() -> Keys:
         return jax.random.split(jax.random.fold_in(key, num_envs), num_envs)  # none of the steps' keys
 
-    state, observation = begin_anew(env, params, state, after, reset_keys)
+    done = after.terminated | after.truncated
+    state, observation = begin_anew(env, params, state, done, after.observation, reset_keys)
     return state, observation, after
 
 
-def act(
-    env: Environment, params: EnvParams, state: EnvState, action: Array, keys: Keys
-) -> tuple[EnvState, TimeStep]:
-    """One step of each copy, and no resets."""
-    if isinstance(env, BatchEnvironment):
-        return env.step_many(state, action, keys, params)
-    return jax.vmap(env.step, (0, 0, 0, None))(state, action, keys, params)
-
-
 def begin_anew(
-    env: Environment, params: EnvParams, state: EnvState, after: TimeStep, keys: Callable[[], Keys]
+    env: Environment,
+    params: EnvParams,
+    state: EnvState,
+    done: Bool[Array, " E"],
+    observation: Observation,
+    keys: Callable[[], Keys],
 ) -> tuple[EnvState, Observation]:
     """A reset where the episode is over. The keys are asked for only if one is.
 
     What a conditional hands through is copied, so that where observations can be made from the state they are.
     """
-    done = after.terminated | after.truncated
-    if isinstance(env, BatchEnvironment):
+    if env.observes_state:
         state = _where_done(done, lambda: reset(env, params, keys())[0], state)
         return state, env.observe_many(state, params)
-    return _where_done(done, lambda: reset(env, params, keys()), (state, after.observation))
+    return _where_done(done, lambda: reset(env, params, keys()), (state, observation))
 
 
 def _where_done(done: Bool[Array, " E"], fresh: Callable[[], EnvState], going_on: EnvState) -> EnvState:

@@ -1,7 +1,11 @@
 """What an environment is: pure functions over one copy, vmapped by whoever needs many."""
 
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl.types import Entities, Metrics, Observation, PRNGKey
@@ -20,74 +24,117 @@ class TimeStep(NamedTuple):
     """The task is over: nothing follows that could be bootstrapped from."""
     truncated: Bool[Array, ""]
     """The time limit was reached: the task would have gone on."""
-    info: Metrics
-    """Measurements after the step; `reward_raw` is always among them."""
+    info: Metrics = {}  # noqa: RUF012 nobody writes into it
+    """Measurements after the step, scalars; `reward_raw` is the mean reward where it is not among them."""
+    left: Bool[Array, " N"] | None = None
+    """This agent's life ended with the step (a car left, an agent died): its value is not bootstrapped across it, and
+    whoever takes its slot remembers nothing. None: lives end with the episode."""
 
 
-@runtime_checkable
-class Environment(Protocol):
-    """A task for N agents. Write it for one copy; resets after an episode's end are the rollout's."""
+class Environment(ABC):
+    """A task for N agents. Write it for one copy; resets after an episode's end are the rollout's.
 
-    @property
-    def num_agents(self) -> int: ...
-    @property
-    def num_landmarks(self) -> int: ...
-    @property
-    def num_actions(self) -> int: ...
-    @property
-    def observation_size(self) -> int: ...
-    @property
-    def max_cycles(self) -> int:
-        """Steps until the time limit."""
-        ...
+    A task states its sizes, as fields of a frozen dataclass, class attributes or properties, and has `reset` and
+    `step`. Everything else has a default here. An environment is hashable: it is a constant of compiled programs.
+    """
 
-    @property
-    def continuous_actions(self) -> bool:
-        """Actions are [N, A] numbers in [0, 1] instead of [N] indices."""
-        ...
+    num_agents: int
+    num_actions: int
+    """Actions of each agent; what an agent cannot do is False in `Observation.action_mask`."""
+    observation_size: int
+    """O: numbers that each agent sees."""
+    max_cycles: int
+    """Steps until the time limit."""
+    continuous_actions: bool = False
+    """Actions are [N, A] numbers in [0, 1] instead of [N] indices."""
+    num_symmetries: int = 1
+    """Rotations and reflections under which the task is the same; 0 is the identity."""
+    observes_state: ClassVar[bool] = False
+    """Whether `observe_many` makes observations from states, which is then cheaper than to hand them through."""
 
-    def default_params(self) -> EnvParams: ...
+    def default_params(self) -> EnvParams:
+        """The numbers of the task, where it has some."""
+        return ()
 
-    def reset(self, key: PRNGKey, params: EnvParams | None = None) -> tuple[EnvState, Observation]: ...
+    @abstractmethod
+    def reset(self, key: PRNGKey, params: EnvParams = ()) -> tuple[EnvState, Observation]:
+        """Begin an episode."""
 
+    @abstractmethod
     def step(
-        self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams | None = None
-    ) -> tuple[EnvState, TimeStep]: ...
+        self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams = ()
+    ) -> tuple[EnvState, TimeStep]:
+        """Let every agent act once. action: [N] indices, or [N, A] numbers in [0, 1]."""
 
+    def from_features(self, features: Float[Array, "N O"]) -> Observation:
+        """The observation around bare feature vectors, as other programs hand them out: everyone is there, and may do
+        everything."""
+        return observe(features, num_actions=self.num_actions)
 
-@runtime_checkable
-class BatchEnvironment(Environment, Protocol):
-    """A task that knows a quicker way to step many copies than mapping its step."""
-
-    def step_many(
-        self, state: EnvState, action: Array, keys: Key[Array, " E"], params: EnvParams | None = None
-    ) -> tuple[EnvState, TimeStep]: ...
-
-    def observe_many(self, state: EnvState, params: EnvParams | None = None) -> Observation:
-        """What is seen in each copy's state."""
-        ...
-
-
-@runtime_checkable
-class SpatialEnvironment(Environment, Protocol):
-    """A task in the plane: what graph networks and symmetry augmentation need besides."""
-
-    @property
-    def own_size(self) -> int:
-        """K of `Entities.own`."""
-        ...
-
-    @property
-    def num_symmetries(self) -> int:
-        """Rotations and reflections under which the task is the same; 0 is the identity."""
-        ...
-
-    def entities(self, observation: Observation) -> Entities: ...
+    def entities(self, observation: Observation) -> Entities:
+        """Take apart what is seen, for graph networks. By default an agent is alone with its features."""
+        num_agents = observation.features.shape[0]
+        nothing, nobody = jnp.zeros((num_agents, 0, 2)), jnp.zeros((num_agents, 0), bool)
+        return Entities(observation.features, nothing, nothing, nobody, nobody)
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
         """The observation of the turned world."""
-        ...
+        return observation
 
     def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
         """The action that does in the turned world what this one does here."""
-        ...
+        return action
+
+    def step_many(
+        self, state: EnvState, action: Array, keys: Key[Array, " E"], params: EnvParams = ()
+    ) -> tuple[EnvState, TimeStep]:
+        """Step E copies. A task may know a quicker way than to map its step."""
+        return jax.vmap(self.step, (0, 0, 0, None))(state, action, keys, params)
+
+    def observe_many(self, state: EnvState, params: EnvParams = ()) -> Observation:
+        """What is seen in each of E states, for a task that `observes_state`."""
+        raise NotImplementedError
+
+
+def observe(
+    features: Float[Array, "N O"],
+    *,
+    num_actions: int | None = None,
+    positions: Float[Array, "N 2"] | None = None,
+    alive: Bool[Array, " N"] | None = None,
+    available: Bool[Array, "N A"] | None = None,
+    adjacency: Bool[Array, "N N"] | None = None,
+    state: Float[Array, " S"] | None = None,
+) -> Observation:
+    """Make an observation and fill its masks.
+
+    alive: which agents are there; all by default. available: which actions each agent has; all of `num_actions` by
+    default. adjacency: entry [i, j] lets i hear j; by default everyone in reach does. state: what a central critic may
+    know; by default all features side by side. Raises ValueError where neither num_actions nor available is given.
+    """
+    num_agents = features.shape[0]
+    if available is None:
+        if num_actions is None:
+            raise ValueError("observe needs num_actions, or available [N, A]")
+        available = jnp.ones((num_agents, num_actions), bool)
+    return Observation(
+        features=features,
+        positions=positions,
+        agent_mask=jnp.ones(num_agents, bool) if alive is None else alive,
+        landmark_mask=None,
+        action_mask=available,
+        adjacency=adjacency,
+        state=state,
+    )
+
+
+def side_by_side(seen: Sequence[Float[Array, " _"]], roles: Sequence[int] | None = None) -> Float[Array, "N O"]:
+    """Features of agents that see different things: each agent's numbers, padded with zeros to the longest.
+
+    roles: an index for each agent, appended as a one-hot, so that shared weights can tell the agents apart; by default
+    every agent has a role of its own.
+    """
+    roles = range(len(seen)) if roles is None else roles
+    length = max(numbers.shape[0] for numbers in seen)
+    rows = jnp.stack([jnp.pad(numbers, (0, length - numbers.shape[0])) for numbers in seen])
+    return jnp.concatenate([rows, jax.nn.one_hot(jnp.asarray(list(roles)), max(roles) + 1)], axis=1)

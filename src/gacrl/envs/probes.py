@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.envs.environment import TimeStep
+from gacrl.envs.environment import Environment, TimeStep, observe
 from gacrl.types import Observation, PRNGKey
 
 PROBES = ("value", "observation", "discount", "action", "both", "message", "late_message")
@@ -37,12 +37,11 @@ class ProbeState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Probe:
+class Probe(Environment):
     """All the probes; `probe` names the one that the default parameters select."""
 
     probe: str = "value"
     num_agents: int = 2
-    num_landmarks: int = 1
     num_actions: int = 2
     observation_size: int = 2
     max_cycles: int = 2
@@ -87,14 +86,7 @@ class Probe:
         seen = jnp.where(blind, 0.0, state.sign)
         features = jnp.zeros((self.num_agents, self.observation_size))
         features = features.at[0].set(jnp.stack([seen, state.clock.astype(float)]))
-        everyone = jnp.ones(self.num_agents, bool)
-        return Observation(
-            features=features,
-            positions=None,
-            agent_mask=everyone,
-            landmark_mask=jnp.ones(self.num_landmarks, bool),
-            action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
-        )
+        return observe(features, num_actions=self.num_actions)
 
 
 def _is(params: ProbeParams, probe: str) -> Bool[Array, ""]:

@@ -1,23 +1,94 @@
-"""Tasks: `spread` and the probes, the scripted policies, and what every task must be."""
+"""Tasks by name: ours, and those that a user brings.
 
-import dataclasses
+A leaf: it imports no jax, and a task only when somebody needs it. A task from outside is at hand once this process
+was given it (`bring`); a run folder alone never loads one.
+"""
 
-from gacrl.config.run import EnvConfig
-from gacrl.tasks.spread.environment import Spread, SpreadParams
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from gacrl.config.checks import unknown
+from gacrl.errors import ConfigError
+from gacrl.tasks.task import Task
+
+DEFAULT = "spread"
+
+_OURS: Mapping[str, tuple[str, str]] = MappingProxyType({"spread": ("gacrl.tasks.spread", "SpreadSettings")})
+"""Per name: the folder, whose `settings` hold a class of this name, and whose `task` holds the record."""
 
 
-def make(config: EnvConfig) -> Spread:
-    """The task that the configuration names."""
-    structure = {field.name for field in dataclasses.fields(Spread)} & {f.name for f in dataclasses.fields(config)}
-    return Spread(
-        **{name: getattr(config, name) for name in structure - {"num_landmarks"}},
-        num_landmarks=config.landmarks,
-        initial_params=SpreadParams(
-            local_ratio=config.local_ratio,
-            coverage_threshold=config.coverage_threshold,
-            coverage_bonus=config.coverage_bonus,
-            arena_scale=config.arena_scale,
-            landmark_speed=config.landmark_speed,
-            reset_distance=config.reset_distance,
-        ),
-    )
+@dataclass(frozen=True)
+class Own:
+    """A task from outside, as it was given."""
+
+    task: Task
+    settings: Any
+    """Those that stand where none are said."""
+    source: Path | None = None
+    """The file that it came from."""
+    digest: str | None = None
+    """SHA-256 of that file."""
+
+
+_OWN: dict[str, Own] = {}
+
+
+def names() -> list[str]:
+    """The tasks that are at hand: ours first."""
+    return [*_OURS, *_OWN]
+
+
+def bring(own: Own) -> None:
+    """Have a task from outside at hand. Raises ConfigError for a name of ours."""
+    if own.task.name in _OURS:
+        raise ConfigError(f"there is a task {own.task.name!r} already: give yours another name")
+    _OWN[own.task.name] = own
+
+
+def brought(name: str) -> Own | None:
+    """A task from outside; None for one of ours, or one that is not at hand."""
+    return _OWN.get(name)
+
+
+def find(name: str) -> Task:
+    """The task of that name. Raises ConfigError with the nearest name where it is not at hand."""
+    if name in _OURS:
+        return import_module(f"{_OURS[name][0]}.task").TASK
+    _require_at_hand(name)
+    return _OWN[name].task
+
+
+def default_settings(name: str) -> Any:
+    """The settings of that task as they stand where nothing is said. Raises ConfigError."""
+    if name in _OURS:
+        folder, kind = _OURS[name]
+        return getattr(import_module(f"{folder}.settings"), kind)()
+    _require_at_hand(name)
+    return _OWN[name].settings
+
+
+def ours(settings: Any) -> tuple[str, Any] | None:
+    """The name and settings of one of our tasks, from its settings or its environment; None for anything else."""
+    for name in _OURS:
+        kind = type(default_settings(name))
+        if isinstance(settings, kind):
+            return name, kind(**{field.name: getattr(settings, field.name) for field in fields(kind)})
+    return None
+
+
+def flag(name: str) -> str:
+    """What a command needs besides to find this task again: nothing for the default one."""
+    own = _OWN.get(name)
+    if own is not None:
+        return f" --env {own.source or 'FILE.py'}:{name}"
+    return "" if name == DEFAULT else f" --env {name}"
+
+
+def _require_at_hand(name: str) -> None:
+    if name not in _OWN:
+        hint = "a task of your own is --env FILE.py:NAME, in Python env="
+        raise ConfigError(unknown("task", name, names(), hint))

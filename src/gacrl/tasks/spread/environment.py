@@ -3,18 +3,18 @@
 N agents must stand on L landmarks without touching each other. Beyond MPE2: L ≠ N, an arena of any size,
 landmarks that move, padded agents, and the readings of the paper's "resets if agents collide".
 
-As in `particles`, arrays may have axes of copies at their end; `Spread.step_many` steps many copies so.
+As in `envs.particles`, arrays may have axes of copies at their end; `Spread.step_many` steps many copies so.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from gacrl.envs.environment import TimeStep
+from gacrl.envs.environment import Environment, TimeStep
 from gacrl.envs.particles import (
     DIRECTIONS,
     Physics,
@@ -27,7 +27,8 @@ from gacrl.envs.particles import (
 )
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
 from gacrl.tasks.spread.potential import assignment_potential, potential_difference
-from gacrl.tasks.spread.shaping import CollisionTerm, paper_shaped_reward
+from gacrl.tasks.spread.settings import SpreadSettings
+from gacrl.tasks.spread.shaping import paper_shaped_reward
 from gacrl.types import Entities, Observation, PRNGKey
 
 CAPTURE_RADIUS = 0.1
@@ -38,33 +39,53 @@ NEAR_DISTANCE = 0.2
 REPORTED_LOCAL_RATIO = 0.5
 """`reward_raw` is always taken at MPE2's default, whatever the learner is trained on."""
 
-RewardKind = Literal["mpe2", "paper", "coverage", "potential"]
-CollisionReset = Literal["off", "truncate", "in_place"]
-
 
 class SpreadParams(NamedTuple):
     """Everything about the task that is a number: change it between steps, nothing recompiles."""
 
-    physics: Physics = Physics()
-    local_ratio: Float[Array, ""] | float = 0.5
+    physics: Physics
+    local_ratio: Float[Array, ""] | float
     """Weight of an agent's own collisions; the shared distance has 1 − local_ratio."""
-    collision_penalty: Float[Array, ""] | float = 1.0
+    collision_penalty: Float[Array, ""] | float
     """0 is the first stage of MPE2's `curriculum`."""
-    coverage_threshold: Float[Array, ""] | float = 0.5
-    """θ of equation (1), of adaptive exploration and of the metric `coverage_theta`."""
-    coverage_bonus: Float[Array, ""] | float = 1.0
+    coverage_threshold: Float[Array, ""] | float
+    """θ of equation (1), of the paper's exploration and of the metric `coverage_theta`."""
+    coverage_bonus: Float[Array, ""] | float
     """Of the reward `coverage`: what a step with every landmark covered adds."""
-    potential_discount: Float[Array, ""] | float | None = None
+    potential_discount: Float[Array, ""] | float | None
     """γ of the reward `potential`; None: 1."""
-    arena_scale: Float[Array, ""] | float = 1.0
+    arena_scale: Float[Array, ""] | float
     """Agents and landmarks start uniformly in [−arena_scale, arena_scale]²."""
-    landmark_speed: Float[Array, ""] | float = 0.0
+    landmark_speed: Float[Array, ""] | float
     """Speed of the landmarks, as a share of an agent's top speed."""
-    reset_distance: Float[Array, ""] | float = 0.2
+    reset_distance: Float[Array, ""] | float
     """Agents this close count as collided for `reset_on_collision`."""
     agent_mask: Bool[Array, " N"] | None = None
     """False for padding; None: all agents are real, and nothing is spent on masks."""
     landmark_mask: Bool[Array, " L"] | None = None
+
+
+def params_of(settings: SpreadSettings, gamma: float = 1.0, padded: bool = False) -> SpreadParams:
+    """The numbers of the task as arrays, so that they are data to every compiled program.
+
+    gamma: the learner's discount, for the reward `potential`. padded: with masks, in which all are there.
+    """
+    params = SpreadParams(
+        physics=Physics(),
+        local_ratio=settings.local_ratio,
+        collision_penalty=1.0,
+        coverage_threshold=settings.coverage_threshold,
+        coverage_bonus=settings.coverage_bonus,
+        potential_discount=gamma if settings.reward == "potential" else None,
+        arena_scale=settings.arena_scale,
+        landmark_speed=settings.landmark_speed,
+        reset_distance=settings.reset_distance,
+    )
+    params = jax.tree.map(lambda number: jnp.asarray(number, float), params)
+    if not padded:
+        return params
+    agents, landmarks = np.ones(settings.num_agents, bool), np.ones(settings.landmarks, bool)
+    return params._replace(agent_mask=jnp.asarray(agents), landmark_mask=jnp.asarray(landmarks))
 
 
 class SpreadState(NamedTuple):
@@ -77,56 +98,31 @@ class SpreadState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Spread:
-    """The structure of the task: what shapes the compiled program. Numbers live in `SpreadParams`."""
+class Spread(SpreadSettings, Environment):
+    """The task of these settings. Its numbers are in `SpreadParams`; those of the settings are where they start."""
 
-    num_agents: int = 3
-    num_landmarks: int = 3
-    max_cycles: int = 25
-    continuous_actions: bool = False
-    num_agent_neighbors: int | None = None
-    """Agents see only this many nearest others, nearest first, zero-padded; None: all, in order."""
-    num_landmark_neighbors: int | None = None
-    terminate_on_success: bool = False
-    """End the episode when every landmark has an agent within `CAPTURE_RADIUS`."""
-    reset_on_collision: CollisionReset = "off"
-    """`truncate` ends the episode, `in_place` draws new places while the episode's clock runs on."""
-    reward: RewardKind = "mpe2"
-    collision_term: CollisionTerm = "per_agent"
-    collision_distance: float = NEAR_DISTANCE
-    """Distance of the collision term in equation (1)."""
-    initial_params: SpreadParams = SpreadParams()
+    observes_state: ClassVar[bool] = True
 
     @property
-    def num_actions(self) -> int:
+    def num_actions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return len(DIRECTIONS)
 
     @property
     def seen_landmarks(self) -> int:
-        return self.num_landmarks if self.num_landmark_neighbors is None else self.num_landmark_neighbors
+        return self.landmarks if self.num_landmark_neighbors is None else self.num_landmark_neighbors
 
     @property
     def seen_agents(self) -> int:
         return self.num_agents - 1 if self.num_agent_neighbors is None else self.num_agent_neighbors
 
     @property
-    def observation_size(self) -> int:
+    def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Velocity, position, landmarks, other agents, their silent channel of two numbers each."""
         return 4 + 2 * self.seen_landmarks + 4 * self.seen_agents
 
     def default_params(self) -> SpreadParams:
-        """`initial_params` as arrays, so that they are data to every compiled program."""
-        return jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, None if jnp.asarray(leaf).dtype == bool else float),
-            self.initial_params,
-        )
-
-    def padded(self) -> "Spread":
-        """The same task with room for absence: masks in its parameters, in which all are there."""
-        agents, landmarks = np.ones(self.num_agents, bool), np.ones(self.num_landmarks, bool)
-        return replace(
-            self, initial_params=self.initial_params._replace(agent_mask=agents, landmark_mask=landmarks)
-        )
+        """The numbers of the settings; γ is 1, and nobody is absent."""
+        return params_of(self)
 
     def reset(self, key: PRNGKey, params: SpreadParams | None = None) -> tuple[SpreadState, Observation]:
         """Agents and landmarks uniform in the arena, agents at rest."""
@@ -229,7 +225,7 @@ class Spread:
             features=_masked(features, agent_mask),
             positions=state.positions,
             agent_mask=_everywhere(agent_mask, (self.num_agents, *copies)),
-            landmark_mask=_everywhere(landmark_mask, (self.num_landmarks, *copies)),
+            landmark_mask=_everywhere(landmark_mask, (self.landmarks, *copies)),
             action_mask=jnp.ones((self.num_agents, self.num_actions, *copies), bool),
             state=pack_state(state),
         )
@@ -243,27 +239,25 @@ class Spread:
             features=features,
             positions=features[:, 2:4],
             agent_mask=jnp.ones(self.num_agents, bool),
-            landmark_mask=jnp.ones(self.num_landmarks, bool),
+            landmark_mask=jnp.ones(self.landmarks, bool),
             action_mask=jnp.ones((self.num_agents, self.num_actions), bool),
         )
 
-    @property
-    def own_size(self) -> int:
-        """Of `entities`: an agent's velocity."""
-        return 2
-
     def entities(self, observation: Observation) -> Entities:
-        """What the features say, thing by thing, without where the origin lies."""
+        """What the features say, thing by thing, without where the origin lies: an agent's own is its velocity.
+
+        MPE2 pads with zeros: what is at distance 0 is not there.
+        """
         features, landmarks_end = observation.features, 4 + 2 * self.seen_landmarks
         agents_end = landmarks_end + 2 * self.seen_agents
-        return Entities(
-            own=features[:, :2],
-            landmarks=features[:, 4:landmarks_end].reshape(self.num_agents, -1, 2),
-            agents=features[:, landmarks_end:agents_end].reshape(self.num_agents, -1, 2),
-        )
+        own = features[:, :2]
+        landmarks = features[:, 4:landmarks_end].reshape(self.num_agents, -1, 2)
+        agents = features[:, landmarks_end:agents_end].reshape(self.num_agents, -1, 2)
+        there = (jnp.square(offsets).sum(-1) > 0 for offsets in (landmarks, agents))
+        return Entities(own, landmarks, agents, *there)
 
     @property
-    def num_symmetries(self) -> int:
+    def num_symmetries(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return NUM_SYMMETRIES
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
@@ -320,12 +314,12 @@ class Spread:
         }
 
     def _place(self, key: Key[Array, "*e"], params: SpreadParams) -> SpreadState:
-        entities, copies = self.num_agents + self.num_landmarks, key.shape
+        entities, copies = self.num_agents + self.landmarks, key.shape
 
         def draw(key: Key[Array, "*e"]) -> Float[Array, "K *e"]:
             if key.ndim:
                 return jax.vmap(draw, out_axes=-1)(key)
-            size = 2 * entities + self.num_landmarks
+            size = 2 * entities + self.landmarks
             return jax.random.uniform(key, (size,), dtype=float, minval=-1.0, maxval=1.0)
 
         draws = draw(key)

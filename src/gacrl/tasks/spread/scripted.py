@@ -1,4 +1,4 @@
-"""Policies that learn nothing: two floors, `random` and `noop`, a ceiling, `oracle`, and `local`, which sees little.
+"""Policies of `spread` that learn nothing: a ceiling, `oracle`, and `local`, which sees little.
 
 The oracle reads the exact state, whatever the agents themselves observe. It assigns agents to landmarks once
 per episode, at the least total squared distance. Then each agent takes the push after which it would coast
@@ -7,9 +7,10 @@ landmarks need not. It is a strong heuristic and no optimum: a learned policy ma
 
 The local one moves as the oracle does, but matches only what it has in sight, nearest pairs first, and anew in every
 step: what can be had in a large team without a view of the whole and without a word.
-"""
 
-from typing import NamedTuple
+Physics and arena scale, which no observation tells, they take from the environment's settings; masks, places and
+velocities of agents and landmarks from the observation.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.particles import DIRECTIONS, Physics, pairwise_offsets
 from gacrl.tasks.spread.assignment import assign
-from gacrl.tasks.spread.environment import CAPTURE_RADIUS, Spread, SpreadParams, SpreadState, reflect, unpack_state
-from gacrl.types import Channel, Decision, Memory, Observation, Policy, PRNGKey
+from gacrl.tasks.spread.environment import (
+    CAPTURE_RADIUS,
+    Spread,
+    SpreadParams,
+    SpreadState,
+    reflect,
+    unpack_state,
+)
+from gacrl.types import Actor, Channel, Decision, Memory, Observation, PRNGKey
 
-SCRIPTED = ("random", "noop", "oracle")
-"""Stand beside every number."""
-PLAYABLE = (*SCRIPTED, "local")
 SIGHT = 5
 """The local policy sees this many nearest landmarks, and as many nearest agents."""
 
@@ -37,55 +42,16 @@ ELBOW_ROOM = 0.02
 """Agents keep this far apart, disc to disc, unless it costs them as much in distance to their targets."""
 
 
-class Scripted(NamedTuple):
-    """A policy, and its memory at an episode's start, both for one environment."""
-
-    policy: Policy
-    initial_memory: Memory
-
-
-def make(name: str, env: Spread) -> Scripted:
-    """The scripted policy of that name for this task; ValueError for a name that is not in `PLAYABLE`.
-
-    The oracle takes physics and arena scale, which no observation tells, from `env.initial_params`; masks,
-    places and velocities of agents and landmarks it reads from the observation.
-    """
-    if name not in PLAYABLE:
-        raise ValueError(f"There is no scripted policy {name!r}, only {', '.join(PLAYABLE)}.")
-    return {"random": _random, "noop": _noop, "oracle": _oracle, "local": _local}[name](env)
-
-
-def _random(env: Spread) -> Scripted:
-    """Every action of the action space is equally likely."""
-
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
-        shape = (env.num_agents, env.num_actions)
-        if env.continuous_actions:
-            return Decision(jax.random.uniform(key, shape)), memory
-        return Decision(jax.random.randint(key, shape[:1], 0, env.num_actions)), memory
-
-    return Scripted(policy, ())
-
-
-def _noop(env: Spread) -> Scripted:
-    """Nobody ever pushes."""
-
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
-        return Decision(_as_action(jnp.zeros((env.num_agents, 2)), env.continuous_actions)), memory
-
-    return Scripted(policy, ())
-
-
-def _oracle(env: Spread) -> Scripted:
+def oracle(env: Spread) -> Actor:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
-    params = env.initial_params
+    params = env.default_params()
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
         if observation.state is None:
             raise ValueError("The oracle needs an environment that puts its state into the observation.")
         state = unpack_state(observation.state, env.num_agents)
         agents, motion = observation.agent_mask, state.landmark_velocities
-        posts, wanted = _posts(state, observation.landmark_mask)
+        posts, wanted = _posts(state, _landmarks(observation))
 
         def assign_agents(memory: Int[Array, " N"]) -> Int[Array, " N"]:
             origins = state.positions[:, None]
@@ -103,10 +69,10 @@ def _oracle(env: Spread) -> Scripted:
         target = _intercept(coasting, posts[landmark], motion[landmark], params)
         return Decision(_steer(env, state, agents, target, free)), landmark
 
-    return Scripted(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
+    return Actor(policy, jnp.full(env.num_agents, UNASSIGNED, jnp.int32))
 
 
-def _local(env: Spread) -> Scripted:
+def local(env: Spread) -> Actor:
     """Each agent decides anew in every step, from the nearest landmarks and agents alone."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
@@ -115,10 +81,10 @@ def _local(env: Spread) -> Scripted:
         state = unpack_state(observation.state, env.num_agents)
         agents = observation.agent_mask
         _, distance = pairwise_offsets(state.positions, state.landmarks)
-        distance = jnp.where(observation.landmark_mask, distance, jnp.inf)
+        distance = jnp.where(_landmarks(observation), distance, jnp.inf)
         _, between = pairwise_offsets(state.positions, state.positions)
         between = jnp.where(_pairs(agents), between, jnp.inf)
-        nearest = lax.top_k(-distance, min(SIGHT, env.num_landmarks))[1]  # [N K]
+        nearest = lax.top_k(-distance, min(SIGHT, env.landmarks))[1]  # [N K]
         others = lax.top_k(-between, min(SIGHT, env.num_agents - 1))[1]
         there = jnp.take_along_axis(between, others, axis=1) < jnp.inf
         group = jnp.concatenate([jnp.arange(env.num_agents)[:, None], others], axis=1)  # [N M], itself first
@@ -128,7 +94,13 @@ def _local(env: Spread) -> Scripted:
         target = state.landmarks[jnp.take_along_axis(nearest, choice[:, None], axis=1)[:, 0]]
         return Decision(_steer(env, state, agents, target, ~agents)), memory
 
-    return Scripted(policy, ())
+    return Actor(policy, ())
+
+
+def _landmarks(observation: Observation) -> Bool[Array, " L"]:
+    """Which landmarks there are."""
+    assert observation.landmark_mask is not None  # spread always shows it
+    return observation.landmark_mask
 
 
 def _greedy_match(distance: Float[Array, "M K"]) -> Int[Array, ""]:
@@ -156,7 +128,7 @@ def _steer(
     free: Bool[Array, " N"],
 ) -> Array:
     """The actions that bring agents to their targets, out of each other's way; `free` ones stay where they like."""
-    physics = env.initial_params.physics
+    physics = env.default_params().physics
     coasting, reach = _coast(state, physics)
     target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
     pushes = _pushes((target - coasting) / reach, env.continuous_actions)

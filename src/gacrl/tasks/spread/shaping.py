@@ -1,13 +1,10 @@
 """The paper's shaped reward."""
 
-from typing import Literal
-
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gacrl.envs.particles import along
-
-CollisionTerm = Literal["per_agent", "once"]
+from gacrl.tasks.spread.settings import CollisionTerm
 
 
 def paper_shaped_reward(

@@ -1,0 +1,153 @@
+"""The record of a task: everything that training, evaluation, comparison and picture need to know of it.
+
+A leaf: it imports no jax, so that names, metrics and settings can be asked for at once.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+from gacrl.errors import ConfigError
+
+Settings: TypeAlias = Any
+"""A frozen dataclass of numbers, strings and tuples."""
+EnvParams: TypeAlias = Any
+EnvState: TypeAlias = Any
+
+
+class Metric(NamedTuple):
+    """How one number of an episode comes from a measurement of its steps."""
+
+    measure: str
+    """A name in `TimeStep.info`."""
+    over: Literal["mean", "sum", "last"] = "mean"
+    """How the steps of an episode are reduced. What happened ever belongs into the state, and is taken last."""
+    unit: str = ""
+    higher_is_better: bool = True
+    label: str = ""
+    """A short name for tables. A metric without one is measured, and stays out of them."""
+    defined_by: tuple[str, ...] = ()
+    """Settings of the task that define it: where they differ it cannot be compared."""
+
+
+class Words(NamedTuple):
+    """What a picture calls the things in it."""
+
+    agent: str = "agent"
+    mark: str = "place"
+    lit: str = "reached"
+
+
+class Part(NamedTuple):
+    """Something that an ablation takes away: what is left, and the settings that change."""
+
+    says: str
+    changes: Mapping[str, Any]
+
+
+def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
+    """Nothing about the task is a number that could change between steps."""
+    return ()
+
+
+def unchanged(settings: Settings, params: EnvParams, share: Any) -> EnvParams:
+    """The task is as difficult at the start as at the end."""
+    return params
+
+
+def complete(settings: Settings) -> bool:
+    """All agents are there from an episode's start to its end."""
+    return False
+
+
+HEADLINE = "return_agent_mean"
+RETURN: Mapping[str, Metric] = MappingProxyType(
+    {HEADLINE: Metric("reward_raw", "sum", label="return"), "reward_raw": Metric("reward_raw", "mean")}
+)
+"""Every task has these: the mean over agents of what they earn, summed over the episode, and per step."""
+
+
+class Task(NamedTuple):
+    """A task. Required: its name, the class of its settings, and how an environment is made of them."""
+
+    name: str
+    settings: type
+    """A frozen dataclass of numbers, strings and tuples: what `--env.X` sets. It needs no jax."""
+    make: Callable[[Settings], Any]
+    """Settings -> Environment, which is hashable: masks and numbers that change belong into its params."""
+    params: Callable[[Settings, float, bool], EnvParams] = no_params
+    """(settings, the learner's γ, with room for absent agents) -> the numbers of the task."""
+    difficulty: Callable[[Settings, EnvParams, Any], EnvParams] = unchanged
+    """(settings, params, share in [0, 1]) -> the params there: what a curriculum moves."""
+    metrics: Mapping[str, Metric] = RETURN
+    """By name. A measure without a metric gets its mean; the return is always there."""
+    headline: str = HEADLINE
+    """Keeps the best policy, and leads tables and progress."""
+    progress: str | None = None
+    """A measure in [0, 1]: drives adaptive exploration and gates. None: exploration falls with time."""
+    references: Mapping[str, Callable[[Any], Any]] = MappingProxyType({})
+    """Scripted policies (Environment -> Actor) beside random and noop. The first is 1 in every score, where random is
+    0, and stands in the tables; the others are played by name."""
+    anchors: Path | None = None
+    """A file of committed scores: of silent and of told policies, with command, seeds and settings."""
+    needs_memory: bool = False
+    """What was seen or heard at earlier steps must be remembered."""
+    scene: Callable[[Settings, EnvState, EnvParams], Any] | None = None
+    """What a picture of a state shows (`gacrl.scene`). None: discs, where positions are known."""
+    edit: Callable[[EnvState, Any], EnvState] | None = None
+    """What a hand may move."""
+    ragged: Callable[[Settings], bool] = complete
+    """Whether agents may be absent, or their lives end inside an episode."""
+    comparable: tuple[str, ...] | None = None
+    """Attributes of the settings that must be equal in one table; None: all."""
+    words: Words = Words()
+    parts: Mapping[str, Part] = MappingProxyType({})
+    """Parts of an ablation that this task alone has."""
+    summary: str = ""
+    """One line on what must be done, for `gacrl tasks`."""
+
+    def metric(self, name: str) -> Metric:
+        """The metric of that name; of a `score_` that of the number which it scales, and of a bare measure its mean."""
+        plain = name.removeprefix("score_")
+        found = self.metrics.get(plain) or RETURN.get(plain) or Metric(plain)
+        return found._replace(higher_is_better=True) if plain != name else found
+
+    def shown(self, measured: Sequence[str]) -> dict[str, str]:
+        """The metrics of tables among those that are measured, headline first, and what they are called there.
+
+        Of a task that defines no metrics all are shown.
+        """
+        bare = [name for name in measured if name not in RETURN] if self.metrics is RETURN else []
+        named = {name: metric.label for name, metric in self.metrics.items() if metric.label}
+        headline = {self.headline: self.metric(self.headline).label or self.headline}
+        labels = {**headline, **named, **{name: name for name in bare}}
+        return {name: label for name, label in labels.items() if name in measured}
+
+    def numbers(self, settings: Settings, env: Any, gamma: float = 1.0, padded: bool = False) -> EnvParams:
+        """What `params` says; where the record says nothing, what the environment has."""
+        return env.default_params() if self.params is no_params else self.params(settings, gamma, padded)
+
+    def with_horizon(self, settings: Settings, steps: int) -> Settings:
+        """The settings with episodes of so many steps. Raises ConfigError where the task has a fixed length."""
+        if "max_cycles" not in {field.name for field in fields(settings)}:
+            raise ConfigError(f"{self.name} has no setting max_cycles: its episodes have a length of their own")
+        return replace(settings, max_cycles=steps)
+
+    def facts(self, settings: Settings, measured: Sequence[str]) -> dict[str, Any]:
+        """What a comparison must know of the task as it is set, as plain data: it stands in every summary.
+
+        measured: the names of the metrics that episodes have.
+        """
+        names = [field.name for field in fields(settings)] if self.comparable is None else self.comparable
+        known = {**RETURN, **self.metrics}
+        return {
+            "name": self.name,
+            "headline": self.headline,
+            "shown": self.shown(measured),
+            "scale": ["random", next(iter(self.references))] if self.references else None,
+            "lower_is_better": [name for name, metric in known.items() if not metric.higher_is_better],
+            "defined_by": {name: list(metric.defined_by) for name, metric in known.items() if metric.defined_by},
+            "comparable": {name: getattr(settings, name) for name in names},
+        }
