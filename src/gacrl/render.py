@@ -1,8 +1,8 @@
 """Pictures of episodes: one frame, or an animated GIF of several, drawn without a display.
 
-Agents are discs of their true size with their number, speech bubbles hold the symbol that each one sends, and
-landmarks are rings of the capture radius that turn green when covered. Colours can be told apart by the
-colour-blind, and nothing is said by colour alone.
+What is drawn is a `gacrl.scene.Scene`: agents are discs with their number, speech bubbles hold the symbol that each one
+sends, and marks are rings that turn green when lit. Colours can be told apart by the colour-blind, and nothing is said
+by colour alone.
 """
 
 import functools
@@ -10,13 +10,15 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from gacrl.evaluation.episodes import Episode, written_whole
+from gacrl.scene import PLAIN, Scene
+from gacrl.tasks.task import Words
 
 SYMBOL_COLOURS = (
     "#1440b8",
@@ -40,6 +42,8 @@ _MARGIN = 0.04
 _TRAIL_STEPS = 8
 _JUMP = 4.0
 """A step of this many radii is a new placement: no trail follows it."""
+_ALARM = "#c0392b"
+"""The rim of an agent that is lit."""
 _COLOURS = 96
 """Of a GIF's soft edges."""
 _SAMPLES = 8
@@ -48,13 +52,21 @@ _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 """How long an episode's first and last frame stay."""
 
 _Point: TypeAlias = tuple[float, float]
+WORDS = Words()
 
 
-def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | float = 10, title: str = "") -> None:
+def gif(
+    episodes: Sequence[Episode],
+    path: Path,
+    size: int = 480,
+    fps: int | float = 10,
+    title: str = "",
+    words: Words = WORDS,
+) -> None:
     """Write the episodes, one after the other, as an animated GIF that is `size` pixels wide.
 
-    Raises OSError where the file cannot be written, ValueError without episodes or for an impossible size or
-    speed.
+    words: what the task calls the things in it. Raises OSError where the file cannot be written, ValueError without
+    episodes, for one without a scene, or for an impossible size or speed.
     """
     if not episodes:
         raise ValueError("a GIF needs at least one episode")
@@ -67,7 +79,7 @@ def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | flo
         moment = 0
         for k, episode in enumerate(episodes, 1):
             note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
-            picture = _Picture(episode, size, title, note)
+            picture = _Picture(episode, size, title, note, words)
             for t in range(episode.num_steps + 1):
                 if moment % step == 0:
                     yield picture.draw(t)
@@ -90,11 +102,11 @@ def gif(episodes: Sequence[Episode], path: Path, size: int = 480, fps: int | flo
         )
 
 
-def frame(episode: Episode, t: int, size: int = 480, title: str = "") -> Image.Image:
+def frame(episode: Episode, t: int, size: int = 480, title: str = "", words: Words = WORDS) -> Image.Image:
     """The world before step t (after the last one: t = T), `size` pixels wide."""
     if not 0 <= t <= episode.num_steps:
         raise ValueError(f"the episode has the frames 0 to {episode.num_steps}, not {t}")
-    return _Picture(episode, size, title).draw(t)
+    return _Picture(episode, size, title, "", words).draw(t)
 
 
 def _durations(num_steps: int, fps: int | float) -> list[int]:
@@ -129,47 +141,60 @@ def _palette(samples: Iterable[Image.Image]) -> Image.Image:
     return palette
 
 
-def _view(episode: Episode) -> tuple[Float[np.ndarray, "2"], float]:
-    """Centre and half the width of the square that holds all that happens, and all of the start."""
-    discs = episode.positions[:, episode.agent_mask].reshape(-1, 2)
-    rings = episode.landmarks[:, episode.landmark_mask].reshape(-1, 2)
-    start = np.full(2, episode.arena_scale)
-    low = np.min([*(discs - episode.agent_radius), *(rings - episode.capture_radius), -start], axis=0)
-    high = np.max([*(discs + episode.agent_radius), *(rings + episode.capture_radius), start], axis=0)
-    return (low + high) / 2, float((high - low).max() / 2)
+def _view(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
+    """Centre and half the width of the square that holds all that happens, and all of the ground."""
+    corners: list[Any] = [scene.ground.reshape(-1, 2), scene.lines.reshape(-1, 2)]
+    for group in (scene.agents, scene.marks):
+        places, radius = group.positions[group.there], group.radius[group.there][:, None]
+        corners += [places - radius, places + radius]
+    if not _has_ground(scene):
+        corners = corners[1:]
+    everything = np.concatenate(corners)
+    low, high = everything.min(0), everything.max(0)
+    return (low + high) / 2, max(float((high - low).max() / 2), 1e-6)
+
+
+def _has_ground(scene: Scene) -> bool:
+    return bool((scene.ground[0, 1] > scene.ground[0, 0]).all())
 
 
 class _Picture:
     """An episode laid out for drawing. The layout is made for a width of 480 pixels and scales with it."""
 
-    def __init__(self, episode: Episode, size: int, title: str = "", note: str = "") -> None:
+    def __init__(self, episode: Episode, size: int, title: str = "", note: str = "", words: Words = WORDS) -> None:
         if not 120 <= size <= 4096:
             raise ValueError(f"the size of a picture must be between 120 and 4096 pixels, not {size}")
-        self.episode = episode
+        if episode.scene is None:
+            raise ValueError("the episode has no scene: there is nothing to draw")
+        self.episode, self._words, self._view = episode, words, episode.scene
         self._size, self._unit = size, size / 480
-        self._agents: list[int] = np.flatnonzero(episode.agent_mask).tolist()
-        self._landmarks: list[int] = np.flatnonzero(episode.landmark_mask).tolist()
-        self._covered, self._return = episode.covered, episode.return_so_far
-        self._symbols = episode.symbols
+        self._return, self._symbols = episode.return_so_far, episode.symbols
 
-        centre, reach = _view(episode)
+        centre, reach = _view(self._view)
         side = size * _SUPERSAMPLING
         self._scale = side * (0.5 - _MARGIN) / reach
         upwards = np.array([1.0, -1.0])
-        self._discs = side / 2 + (episode.positions - centre) * upwards * self._scale
-        self._rings = side / 2 + (episode.landmarks - centre) * upwards * self._scale
 
-        x, y = (side / 2 - centre * upwards * self._scale).tolist()
-        half = episode.arena_scale * self._scale
-        self._ground = Image.new("RGB", (side, side), _OUTSIDE)
-        ground = ImageDraw.Draw(self._ground)
-        ground.rectangle((x - half, y - half, x + half, y + half), _PAPER)
-        inset, small = 5 * self._unit * _SUPERSAMPLING, _font(self._px(9) * _SUPERSAMPLING)
-        if 2 * small.getlength("start area") < half:
-            ground.text((x + half - inset, y + half - inset), "start area", UNCOVERED, small, "rb")
+        def placed(points: Any) -> Float[np.ndarray, "..."]:
+            return side / 2 + (points - centre) * upwards * self._scale
+
+        self._discs, self._rings = placed(self._view.agents.positions), placed(self._view.marks.positions)
+        self._lines = placed(self._view.lines)
+        self._ground = Image.new("RGB", (side, side), _OUTSIDE if _has_ground(self._view) else _PAPER)
+        if _has_ground(self._view):
+            self._lay_ground(placed(self._view.ground[0]))
         self._header, self._footer = self._px(38), self._px(38) + size
         self._page = Image.new("RGB", (size, self._footer + self._px(92)), _PAPER)
         self._lay_out(ImageDraw.Draw(self._page), title, note)
+
+    def _lay_ground(self, corners: Float[np.ndarray, "2 2"]) -> None:
+        """Where everything starts."""
+        ground = ImageDraw.Draw(self._ground)
+        (left, bottom), (right, top) = corners.tolist()
+        ground.rectangle((left, top, right, bottom), _PAPER)
+        inset, small = 5 * self._unit * _SUPERSAMPLING, _font(self._px(9) * _SUPERSAMPLING)
+        if 4 * small.getlength("start area") < right - left:
+            ground.text((right - inset, bottom - inset), "start area", UNCOVERED, small, "rb")
 
     def draw(self, t: int) -> Image.Image:
         """The frame before step t."""
@@ -177,9 +202,11 @@ class _Picture:
         page.paste(self._scene(t), (0, self._header))
         draw, px = ImageDraw.Draw(page), self._px
         steps, y = self.episode.num_steps, self._footer
+        marks = self._view.marks
+        count = f"{(marks.lit & marks.there)[t].sum()} / {marks.there[t].sum()}"
         values = (
             f"{t} / {steps}",
-            f"{self._covered[t].sum()} / {len(self._landmarks)}",
+            count if marks.there.any() else "",
             f"{self._return[t]:.1f}".replace("-", "−"),
         )
         for (x, anchor), value in zip(self._columns(), values, strict=True):
@@ -200,77 +227,101 @@ class _Picture:
         """What no step changes: title, captions and legend."""
         px, small = self._px, _font(self._px(11))
         title = " ".join(title.split())
+        marks = int(self._view.marks.there.any(0).sum())
         if not title:
-            title = f"{_count(len(self._agents), 'agent')}, {_count(len(self._landmarks), 'landmark')}"
+            title = _count(int(self._view.agents.there.any(0).sum()), self._words.agent)
+            title += f", {_count(marks, self._words.mark)}" if marks else ""
         bold, room = _font(px(14), True), self._size - px(44) - small.getlength(note)
         while bold.getlength(title) > room:
             title = title.rstrip("…")[:-1] + "…"
         draw.text((px(16), px(19)), title, _INK, bold, "lm")
         draw.text((self._size - px(16), px(19)), note, _FAINT, small, "rm")
-        captions = ("step", "landmarks covered", "return so far")
+        captions = ("step", f"{self._words.mark}s {self._words.lit}" if marks else "", "return so far")
         for (x, anchor), caption in zip(self._columns(), captions, strict=True):
             draw.text((x, self._footer + px(17)), caption, _FAINT, small, anchor)
 
-        words = ["agent", "landmark", "covered"]
-        words += [] if self.episode.adjacency is None else ["can hear"]
-        words += [] if self._symbols is None else ["message"]
+        kinds = {"agent": self._words.agent}
+        kinds |= {"mark": self._words.mark, "lit": self._words.lit} if marks else {}
+        kinds |= {} if self.episode.adjacency is None else {"edge": "can hear"}
+        kinds |= {} if self._symbols is None else {"message": "message"}
+        words = list(kinds.values())
         icon = px(20)
         widths = [icon + px(5) + small.getlength(word) for word in words]
         gap = min(px(30), (self._size - px(24) - sum(widths)) / len(words))
         x, y = (self._size - sum(widths) - gap * (len(words) - 1)) / 2, self._footer + px(75)
         draw.line((px(16), y - px(18), self._size - px(16), y - px(18)), _BORDER, max(1, px(1)))
-        for word, width in zip(words, widths, strict=True):
-            self._page.paste(self._specimen(word, icon), (round(x), y - icon // 2))
+        for (kind, word), width in zip(kinds.items(), widths, strict=True):
+            self._page.paste(self._specimen(kind, icon), (round(x), y - icon // 2))
             draw.text((x + icon + px(5), y), word, _INK, small, "lm")
             x += width + gap
 
-    def _specimen(self, word: str, size: int) -> Image.Image:
+    def _specimen(self, kind: str, size: int) -> Image.Image:
         """What the legend shows beside a word."""
         side = float(size * _SUPERSAMPLING)
         image = Image.new("RGB", (round(side), round(side)), _PAPER)
         pen, middle = _Pen(image, self._unit), (side / 2, side / 2)
-        if word == "agent":
+        if kind == "agent":
             pen.disc(middle, side * 0.44)
             pen.number(middle, side * 0.44, "1")
-        elif word == "can hear":
+        elif kind == "edge":
             pen.edge((0.0, side * 0.75), (side, side * 0.25), 120)
-        elif word == "message":
+        elif kind == "message":
             pen.bubble((side * 0.1, side * 0.95), side * 0.36, 0, side * 0.45)
         else:
-            pen.landmark(middle, side * 0.36, word == "covered")
-            pen.ring(middle, side * 0.36, word == "covered")
+            pen.landmark(middle, side * 0.36, kind == "lit")
+            pen.ring(middle, side * 0.36, kind == "lit")
         return image.reduce(_SUPERSAMPLING)
 
     def _scene(self, t: int) -> Image.Image:
-        episode, image = self.episode, self._ground.copy()
-        pen = _Pen(image, self._unit)
-        now = min(t, episode.num_steps - 1)  # nothing is said after the end: the last words stay
+        image = self._ground.copy()
+        pen, agents, marks = _Pen(image, self._unit), self._view.agents, self._view.marks
         discs: list[_Point] = [(x, y) for x, y in self._discs[t].tolist()]
         rings: list[_Point] = [(x, y) for x, y in self._rings[t].tolist()]
-        radius, capture = episode.agent_radius * self._scale, episode.capture_radius * self._scale
+        sizes: list[float] = (agents.radius[t] * self._scale).tolist()
+        reach: list[float] = (marks.radius[t] * self._scale).tolist()
+        seen: list[int] = np.flatnonzero(agents.there[t]).tolist()
+        places: list[int] = np.flatnonzero(marks.there[t]).tolist()
 
-        for i in self._agents:
-            pen.trail(self._discs[max(0, t - _TRAIL_STEPS) : t + 1, i].tolist(), radius)
-        if episode.adjacency is not None:
-            hears = episode.adjacency[now]
-            strength = max(50, min(120, 4000 // max(int(hears.sum()), 1)))
-            for i, j in np.argwhere(hears).tolist():
-                if i < j or not hears[j, i]:
-                    pen.edge(discs[j], discs[i], strength, None if hears[j, i] else radius)
-        for j in self._landmarks:
-            pen.landmark(rings[j], capture, bool(self._covered[t, j]))
-        for i in self._agents:
-            pen.disc(discs[i], radius)
-        for j in self._landmarks:
-            pen.ring(rings[j], capture, bool(self._covered[t, j]))
-        for i in self._agents:
-            pen.number(discs[i], radius, str(i))
+        for start, end in self._lines[t].tolist():
+            pen.road(start, end)
+        for i in seen:
+            pen.trail(self._trail(t, i), sizes[i])
+        self._edges(pen, t, discs, sizes)
+        for j in places:
+            pen.landmark(rings[j], reach[j], bool(marks.lit[t, j]), int(marks.colour[t, j]))
+        for i in seen:
+            pen.disc(discs[i], sizes[i], int(agents.colour[t, i]), bool(agents.lit[t, i]))
+        for j in places:
+            pen.ring(rings[j], reach[j], bool(marks.lit[t, j]))
+        for i in seen:
+            pen.number(discs[i], sizes[i], str(i))
         if self._symbols is not None:
-            for i in self._agents:
-                symbol = int(self._symbols[now, i])
-                if symbol >= 0:
-                    pen.bubble(discs[i], radius, symbol)
+            spoken = self._symbols[self._now(t)]
+            for i in seen:
+                if spoken[i] >= 0:
+                    pen.bubble(discs[i], sizes[i], int(spoken[i]))
         return image.reduce(_SUPERSAMPLING)
+
+    def _now(self, t: int) -> int:
+        """The step whose words and graph are shown: nothing is said after the end, the last words stay."""
+        return min(t, self.episode.num_steps - 1)
+
+    def _trail(self, t: int, agent: int) -> list[list[float]]:
+        """Where an agent came from, as far as it has been there all the time."""
+        there = self._view.agents.there[max(0, t - _TRAIL_STEPS) : t + 1, agent]
+        since = len(there) - 1 - int(np.argmin(there[::-1])) + 1 if not there.all() else 0
+        return self._discs[max(0, t - _TRAIL_STEPS) + since : t + 1, agent].tolist()
+
+    def _edges(self, pen: "_Pen", t: int, discs: Sequence[_Point], sizes: Sequence[float]) -> None:
+        """Who hears whom."""
+        if self.episode.adjacency is None:
+            return
+        there = self._view.agents.there[t]
+        hears = self.episode.adjacency[self._now(t)] & there[:, None] & there[None, :]
+        strength = max(50, min(120, 4000 // max(int(hears.sum()), 1)))
+        for i, j in np.argwhere(hears).tolist():
+            if i < j or not hears[j, i]:
+                pen.edge(discs[j], discs[i], strength, None if hears[j, i] else sizes[i])
 
 
 class _Pen:
@@ -297,24 +348,33 @@ class _Pen:
             wings = [_towards(tip, angle + turn, -7 * self._unit) for turn in (0.45, -0.45)]
             self._draw.polygon([tip, *wings], _RIM)
 
-    def landmark(self, point: _Point, radius: float, covered: bool) -> None:
-        """A cross in a dashed ring, or a green disc."""
+    def road(self, start: Sequence[float], end: Sequence[float]) -> None:
+        """A line of the ground, from where to where."""
+        self._draw.line((*start, *end), _BORDER, self._width(2))
+
+    def landmark(self, point: _Point, radius: float, covered: bool, colour: int = PLAIN) -> None:
+        """A cross in a dashed ring, or a green disc; one with a colour of its own is drawn in it."""
+        ink = UNCOVERED if colour == PLAIN else SYMBOL_COLOURS[colour % len(SYMBOL_COLOURS)]
         if covered:
             self._circle(point, radius, fill=_see_through(COVERED, 90))
-            return
+            if colour == PLAIN:
+                return
         for start in range(0, 360, 30):
-            self._draw.arc(_box(point, radius), start, start + 18, UNCOVERED, self._width(1.5))
+            self._draw.arc(_box(point, radius), start, start + 18, ink, self._width(1.5 if colour == PLAIN else 3))
         for angle in (0.0, math.pi / 2):
             ends = (*_towards(point, angle, radius * 0.3), *_towards(point, angle, -radius * 0.3))
-            self._draw.line(ends, UNCOVERED, self._width(1.5))
+            self._draw.line(ends, ink, self._width(1.5 if colour == PLAIN else 3))
 
     def ring(self, point: _Point, radius: float, covered: bool) -> None:
         """What marks a covered landmark through the agent that stands on it."""
         if covered:
             self._circle(point, radius, outline=COVERED, width=self._width(3))
 
-    def disc(self, point: _Point, radius: float) -> None:
-        self._circle(point, radius, _see_through(_BODY, 200), _RIM, self._width(1.5))
+    def disc(self, point: _Point, radius: float, colour: int = PLAIN, alarm: bool = False) -> None:
+        """An agent; the rim has its own colour, or that of an alarm."""
+        own = _RIM if colour == PLAIN else SYMBOL_COLOURS[colour % len(SYMBOL_COLOURS)]
+        width = 1.5 if colour == PLAIN and not alarm else 3
+        self._circle(point, radius, _see_through(_BODY, 200), _ALARM if alarm else own, self._width(width))
 
     def number(self, point: _Point, radius: float, text: str) -> None:
         size = max(radius * (0.85 if len(text) < 2 else 0.7), 7 * self._unit)

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Key
 
 from gacrl.envs import copies
-from gacrl.envs.environment import Environment, EnvParams, EnvState
+from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
+from gacrl.networks.memory import restarted
 from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Rollout, Transition
 
 
@@ -28,19 +29,16 @@ def start(env: Environment, params: EnvParams, memory: Memory, key: PRNGKey, num
     return Carry(env_state, observation, memories, jnp.ones(num_envs, bool))
 
 
-def step(
+def act(
     env: Environment,
     policy: Policy,
-    initial_memory: Memory,
     params: EnvParams,
     carry: Carry,
-    key: PRNGKey,
+    keys: Key[Array, "E 3"],
     channel: Channel | None = None,
-) -> tuple[Carry, Transition]:
-    """Every environment takes one step; those whose episode ended are reset, with fresh memory."""
+) -> tuple[EnvState, Memory, Transition]:
+    """Every environment takes one step, and none is reset: its state, the policy's memory, and what happened."""
     channel = Channel() if channel is None else channel
-
-    keys = jax.random.split(key, (carry.first.shape[0], 3))
     decision, memory = jax.vmap(policy, (0, 0, 0, None))(carry.memory, carry.observation, keys[:, 0], channel)
     step_mapped = jax.vmap(env.step, (0, 0, 0, None))  # and not `step_many`: docs/design.md
     env_state, after = step_mapped(carry.env_state, decision.action, keys[:, 1], params)
@@ -52,14 +50,56 @@ def step(
         truncated=after.truncated,
         first=carry.first,
         next_observation=after.observation,
-        info=after.info,
+        info=measured(after),
+        left=after.left,
     )
-    env_state, observation = copies.begin_anew(env, params, env_state, after, lambda: keys[:, 2])
-    done = after.terminated | after.truncated
-    keep = jax.vmap(
-        lambda done, old: jax.tree.map(lambda new, old: jnp.where(done, new, old), initial_memory, old)
+    return env_state, memory, transition
+
+
+def measured(after: TimeStep) -> dict[str, Array]:
+    """The measurements of a step, of one environment or of many; the mean reward of those who were there is added
+    where the task does not say it."""
+    if "reward_raw" in after.info:
+        return after.info
+    there = after.observation.agent_mask
+    mean = jnp.where(there, after.reward, 0.0).sum(-1) / jnp.maximum(there.sum(-1), 1)
+    return {**after.info, "reward_raw": mean}
+
+
+def renew(
+    env: Environment,
+    initial_memory: Memory,
+    params: EnvParams,
+    env_state: EnvState,
+    memory: Memory,
+    transition: Transition,
+    keys: Key[Array, "E 3"],
+) -> Carry:
+    """Reset those whose episode has ended, with fresh memory; whose life has ended inside one forgets."""
+    over = transition.terminated | transition.truncated
+    env_state, observation = copies.begin_anew(
+        env, params, env_state, over, transition.next_observation, lambda: keys[:, 2]
     )
-    return Carry(env_state, observation, keep(done, memory), done), transition
+    done = transition.terminated | transition.truncated
+    memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, done)
+    if transition.left is not None:
+        memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, transition.left)
+    return Carry(env_state, observation, memory, done)
+
+
+def step(
+    env: Environment,
+    policy: Policy,
+    initial_memory: Memory,
+    params: EnvParams,
+    carry: Carry,
+    key: PRNGKey,
+    channel: Channel | None = None,
+) -> tuple[Carry, Transition]:
+    """Every environment takes one step; those whose episode ended are reset, with fresh memory."""
+    keys = jax.random.split(key, (carry.first.shape[0], 3))
+    env_state, memory, transition = act(env, policy, params, carry, keys, channel)
+    return renew(env, initial_memory, params, env_state, memory, transition, keys), transition
 
 
 def collect(

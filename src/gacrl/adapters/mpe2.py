@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from gacrl.envs.environment import Environment
 from gacrl.errors import UserError
-from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, metric_names, no_steps
+from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_steps, table_of
 from gacrl.tasks.spread.environment import REPORTED_LOCAL_RATIO, Spread, SpreadState
+from gacrl.tasks.spread.settings import METRICS
 from gacrl.types import Channel, Memory, Policy, PRNGKey
 
 _FIRST_SEED = 700_000
@@ -21,26 +23,27 @@ _FIRST_SEED = 700_000
 
 
 def evaluate(
-    env: Spread, policy: Policy, initial_memory: Memory, key: PRNGKey, num_episodes: int
+    env: Environment, policy: Policy, initial_memory: Memory, key: PRNGKey, num_episodes: int
 ) -> dict[str, np.ndarray]:
     """The metrics [K] of K episodes of MPE2's simple_spread_v3 with the settings of `env`.
 
     The episodes run side by side, so that the policy is called once a step. Raises UserError for what MPE2
-    does not have: other than N landmarks, another arena, moving landmarks, resets on collision, padding.
+    does not have: another task, other than N landmarks, another arena, moving landmarks, resets on collision.
     """
-    _require_possible(env)
+    env = _require_possible(env)
     worlds = [_World(env, _FIRST_SEED + episode) for episode in range(num_episodes)]
     params = env.default_params()
     act = jax.jit(jax.vmap(lambda memory, seen, key: policy(memory, seen, key, Channel())))
     observe = jax.jit(jax.vmap(lambda state: env.observe(state, params)))
-    measures = sorted(jax.eval_shape(lambda: env.measure(env.reset(key)[0], params)))
+    measures = jax.eval_shape(lambda: env.measure(env.reset(key)[0], params))
+    table = table_of(list(measures), METRICS)
 
     @jax.jit
     @jax.vmap
     def count(going: Array, tally: Tally, state: SpreadState, reward: Array) -> Tally:
         return count_step_if(going, tally, {**env.measure(state, params), "reward_raw": reward})
 
-    tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
+    tally = jax.vmap(lambda _: no_steps(table))(jnp.arange(num_episodes))
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_episodes, *leaf.shape)), initial_memory)
     going = np.ones(num_episodes, bool)
     for step_key in jax.random.split(key, env.max_cycles):
@@ -52,8 +55,8 @@ def evaluate(
         tally = count(going, tally, _stacked(worlds), np.array(rewards, np.float32))
         # A new array: JAX may still be reading the old one, which it need not have copied.
         going = going & np.array([not world.over for world in worlds])
-    metrics = jax.vmap(lambda tally: episode_metrics(tally, measures))(tally)
-    return dict(zip(metric_names(measures), np.asarray(metrics).T, strict=True))
+    metrics = jax.vmap(lambda tally: episode_metrics(tally, table))(tally)
+    return dict(zip(table.names, np.asarray(metrics).T, strict=True))
 
 
 class _World:
@@ -106,15 +109,16 @@ def _stacked(worlds: list[_World]) -> SpreadState:
     )
 
 
-def _require_possible(env: Spread) -> None:
-    params = env.initial_params
+def _require_possible(env: Environment) -> Spread:
+    if not isinstance(env, Spread):
+        raise UserError("MPE2 is asked for spread only: evaluate this run with --backend jax")
     lacks = {
-        f"{env.num_landmarks} landmarks for {env.num_agents} agents": env.num_landmarks != env.num_agents,
-        f"an arena scale of {params.arena_scale}": params.arena_scale != 1.0,
-        "moving landmarks": params.landmark_speed != 0.0,
+        f"{env.landmarks} landmarks for {env.num_agents} agents": env.landmarks != env.num_agents,
+        f"an arena scale of {env.arena_scale}": env.arena_scale != 1.0,
+        "moving landmarks": env.landmark_speed != 0.0,
         "resets on collision": env.reset_on_collision != "off",
-        "padded agents": params.agent_mask is not None,
     }
     for thing, wanted in lacks.items():
         if wanted:
             raise UserError(f"MPE2 has no {thing}: evaluate this run with --backend jax")
+    return env

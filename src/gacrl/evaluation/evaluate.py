@@ -1,6 +1,7 @@
 """Playing a policy on fixed episodes and measuring them."""
 
 import zlib
+from collections.abc import Mapping
 from typing import Literal
 
 import jax
@@ -9,7 +10,8 @@ from jaxtyping import Array, Float
 
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams
-from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, metric_names, no_steps
+from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_steps, table_of
+from gacrl.tasks.task import RETURN, Metric
 from gacrl.types import Channel, Memory, Policy, PRNGKey
 
 Stream = Literal["training", "monitor", "gate", "report"]
@@ -32,16 +34,18 @@ def evaluate(
     key: PRNGKey,
     num_episodes: int,
     channel: Channel | None = None,
+    metrics: Mapping[str, Metric] = RETURN,
 ) -> dict[str, Float[Array, " K"]]:
     """The metrics of K episodes, each up to its end or the environment's time limit.
 
-    The key fixes the starts and the policy's draws: the same key gives every policy the same starts.
+    metrics: those of the task; a measure without one gets its mean. The key fixes the starts and the policy's draws:
+    the same key gives every policy the same starts.
     """
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes)
     first_step = jax.eval_shape(lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1])
-    measures = sorted(first_step.info)
-    tally = jax.vmap(lambda _: no_steps(measures))(jnp.arange(num_episodes))
+    table = table_of(list(first_step.info), metrics)
+    tally = jax.vmap(lambda _: no_steps(table))(jnp.arange(num_episodes))
 
     def one_step(loop: tuple[rollout.Carry, Array, Tally], key: PRNGKey):
         carry, going, tally = loop
@@ -54,5 +58,5 @@ def evaluate(
         (carry, jnp.ones(num_episodes, bool), tally),
         jax.random.split(act_key, env.max_cycles),
     )
-    metrics = jax.vmap(lambda tally: episode_metrics(tally, measures))(tally)
-    return dict(zip(metric_names(measures), metrics.T, strict=True))
+    values = jax.vmap(lambda tally: episode_metrics(tally, table))(tally)
+    return dict(zip(table.names, values.T, strict=True))

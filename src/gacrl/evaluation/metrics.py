@@ -1,50 +1,51 @@
 """From the measurements of steps to the metrics of episodes, under the names that users rely on."""
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from gacrl.envs.environment import Environment, EnvParams
+from gacrl.rollout import measured
+from gacrl.tasks.task import RETURN, Metric
 from gacrl.types import Metrics
 
-Reduction = Literal["mean", "sum", "last"]
+
+class Table(NamedTuple):
+    """Which metrics an episode has: those of its task, and the mean of every measure that has none."""
+
+    measures: tuple[str, ...]
+    """What a step measures, sorted."""
+    metrics: tuple[tuple[str, Metric], ...]
+    """Names and definitions, in the order of their vectors."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the metrics, in the order of their vectors."""
+        return tuple(name for name, _ in self.metrics)
 
 
-class EpisodeMetric(NamedTuple):
-    """How one number of an episode comes from a measurement of its steps."""
-
-    measure: str
-    over_steps: Reduction
-
-
-_RADII = ("0.1", "0.2", "0.5")
-EPISODE_METRICS: dict[str, EpisodeMetric] = {
-    # MPE2's own reward at local ratio 0.5, the mean over agents: summed, and per step.
-    "return_agent_mean": EpisodeMetric("reward_raw", "sum"),
-    "reward_raw": EpisodeMetric("reward_raw", "mean"),
-    # The paper's equation (1), the team's reward per step.
-    "reward_shaped": EpisodeMetric("reward_shaped", "mean"),
-    # Fraction of landmarks with an agent within the radius.
-    **{f"coverage_mean_{r}": EpisodeMetric(f"coverage_{r}", "mean") for r in _RADII},
-    **{f"coverage_final_{r}": EpisodeMetric(f"coverage_{r}", "last") for r in _RADII},
-    "coverage_mean_theta": EpisodeMetric("coverage_theta", "mean"),
-    "success_final_0.1": EpisodeMetric("success_0.1", "last"),
-    # Arena units.
-    "distance_agent_landmark": EpisodeMetric("distance_agent_landmark", "mean"),
-    "distance_landmark_agent": EpisodeMetric("distance_landmark_agent", "mean"),
-    "distance_agent_agent": EpisodeMetric("distance_agent_agent", "mean"),
-    # Touching pairs, summed over the steps; and the paper's column: agents with a neighbour within 0.2.
-    "collisions": EpisodeMetric("collisions", "sum"),
-    "near_agents": EpisodeMetric("near_agents", "mean"),
-}
+def table_of(measures: Sequence[str], metrics: Mapping[str, Metric]) -> Table:
+    """The metrics of a task that measures these things."""
+    known = {**metrics, **{name: metric for name, metric in RETURN.items() if name not in metrics}}
+    defined = {name: metric for name, metric in known.items() if metric.measure in measures}
+    bare = sorted(set(measures) - {metric.measure for metric in defined.values()})
+    return Table(tuple(sorted(measures)), (*defined.items(), *((name, Metric(name)) for name in bare)))
 
 
-def metric_names(measures: Sequence[str]) -> tuple[str, ...]:
-    """The episode metrics of a task that measures these things, in the order of their vectors."""
-    return tuple(name for name, metric in EPISODE_METRICS.items() if metric.measure in measures)
+def measures_of(env: Environment, params: EnvParams) -> list[str]:
+    """The names of what a step of this task measures."""
+
+    def info() -> Metrics:
+        key = jax.random.key(0)
+        shape = (env.num_agents, env.num_actions)
+        action = jnp.zeros(shape) if env.continuous_actions else jnp.zeros(shape[0], jnp.int32)
+        return measured(env.step(env.reset(key, params)[0], action, key, params)[1])
+
+    return list(jax.eval_shape(info))
 
 
 class Tally(NamedTuple):
@@ -56,9 +57,9 @@ class Tally(NamedTuple):
     steps: Int[Array, ""]
 
 
-def no_steps(measures: Sequence[str]) -> Tally:
+def no_steps(table: Table) -> Tally:
     """The tally before an episode's first step."""
-    zeros = jnp.zeros(len(measures))
+    zeros = jnp.zeros(len(table.measures))
     return Tally(zeros, zeros, jnp.zeros((), jnp.int32))
 
 
@@ -74,16 +75,12 @@ def count_step_if(going: Bool[Array, ""], tally: Tally, info: Metrics) -> Tally:
     return jax.tree.map(lambda new, old: jnp.where(going, new, old), counted, tally)
 
 
-def episode_metrics(tally: Tally, measures: Sequence[str]) -> Float[Array, " K"]:
-    """The metrics of a finished episode, in the order of `metric_names(measures)`.
-
-    measures: the names of the tally's measurements, sorted.
-    """
+def episode_metrics(tally: Tally, table: Table) -> Float[Array, " K"]:
+    """The metrics of a finished episode, in the order of the table."""
     means = tally.total / jnp.maximum(tally.steps, 1)
     candidates = jnp.concatenate([means, tally.total, tally.last])
-    offset = {"mean": 0, "sum": len(measures), "last": 2 * len(measures)}
-    chosen = [EPISODE_METRICS[name] for name in metric_names(measures)]
-    places = [offset[metric.over_steps] + measures.index(metric.measure) for metric in chosen]
+    offset = {"mean": 0, "sum": len(table.measures), "last": 2 * len(table.measures)}
+    places = [offset[metric.over] + table.measures.index(metric.measure) for _, metric in table.metrics]
     return candidates[np.array(places)]
 
 
@@ -96,9 +93,9 @@ class EpisodeSummary(NamedTuple):
     last: Float[Array, " K"]
 
 
-def no_episodes(measures: Sequence[str]) -> EpisodeSummary:
+def no_episodes(table: Table) -> EpisodeSummary:
     """Before any episode has ended."""
-    zeros = jnp.zeros(len(metric_names(measures)))
+    zeros = jnp.zeros(len(table.metrics))
     return EpisodeSummary(jnp.zeros((), jnp.int32), zeros, zeros, zeros)
 
 

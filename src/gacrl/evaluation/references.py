@@ -1,31 +1,94 @@
-"""Policies that learn nothing, on the very starts of the closing evaluation."""
+"""Policies that learn nothing, on the very starts of the closing evaluation: random, noop, and the task's own."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from gacrl import tasks
+from gacrl.config.checks import unknown
+from gacrl.envs.environment import Environment
+from gacrl.errors import ConfigError
+from gacrl.evaluation.episodes import Look
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.tasks.spread import scripted
-from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.task import Task
+from gacrl.types import Actor, Channel, Decision, Memory, Observation, PRNGKey
+
+FLOORS = ("random", "noop")
+"""Every task has them."""
 
 
-def evaluate_scripted(env: Spread, num_episodes: int) -> dict[str, dict[str, float]]:
-    """The metrics of random, noop and oracle on the very starts of the closing evaluation."""
-    return {name: play_scripted(name, env, num_episodes) for name in scripted.SCRIPTED}
+def random(env: Environment) -> Actor:
+    """Every available action is equally likely."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if env.continuous_actions:
+            return Decision(jax.random.uniform(key, (env.num_agents, env.num_actions))), memory
+        available = observation.action_mask
+        drawn = jax.random.randint(key, (env.num_agents,), 0, available.sum(-1))
+        return Decision((jnp.cumsum(available, -1) > drawn[:, None]).argmax(-1)), memory
+
+    return Actor(policy, ())
 
 
-def play_scripted(name: str, env: Spread, num_episodes: int) -> dict[str, float]:
+def noop(env: Environment) -> Actor:
+    """Every agent takes its first available action, or pushes nowhere."""
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+        if env.continuous_actions:
+            return Decision(jnp.zeros((env.num_agents, env.num_actions))), memory
+        return Decision(observation.action_mask.argmax(-1)), memory
+
+    return Actor(policy, ())
+
+
+def playable(task: Task) -> list[str]:
+    """The scripted policies of a task, by name."""
+    return [*FLOORS, *task.references]
+
+
+def shown(task: Task) -> list[str]:
+    """Those that stand beside every number: the floors, and the first of the task's own."""
+    return [*FLOORS, *list(task.references)[:1]]
+
+
+def actor(task: Task, name: str, env: Environment) -> Actor:
+    """The scripted policy of that name in this environment. Raises ConfigError where there is none."""
+    makers: dict[str, Callable[[Any], Actor]] = {"random": random, "noop": noop, **task.references}
+    if name not in makers:
+        raise ConfigError(unknown("scripted policy", name, list(makers), f"of {task.name}"))
+    return makers[name](env)
+
+
+def evaluate_scripted(task: str, settings: Any, num_episodes: int) -> dict[str, dict[str, float]]:
+    """The metrics of those that are shown, on the very starts of the closing evaluation."""
+    return {name: play_scripted(name, task, settings, num_episodes) for name in shown(tasks.find(task))}
+
+
+def play_scripted(name: str, task: str, settings: Any, num_episodes: int) -> dict[str, float]:
     """The metrics of one scripted policy there."""
-    metrics = scripted_program(name, env, num_episodes)(env.default_params(), stream_key("report"))
+    found = tasks.find(task)
+    params = found.numbers(settings, found.make(settings))
+    metrics = scripted_program(name, task, settings, num_episodes)(params, stream_key("report"))
     return {metric: float(np.mean(values)) for metric, values in metrics.items()}
 
 
 @cache
-def scripted_program(name: str, env: Spread, num_episodes: int) -> Callable[..., dict[str, jax.Array]]:
+def scripted_program(
+    name: str, task: str, settings: Any, num_episodes: int
+) -> Callable[..., dict[str, jax.Array]]:
     """A scripted policy's evaluation, traced once a process."""
-    actor = scripted.make(name, env)
+    found = tasks.find(task)
+    env = found.make(settings)
+    policy, memory = actor(found, name, env)
     return jax.jit(
-        lambda params, key: evaluate(env, actor.policy, actor.initial_memory, params, key, num_episodes)
+        lambda params, key: evaluate(env, policy, memory, params, key, num_episodes, metrics=found.metrics)
     )
+
+
+def look_of(task: Task, settings: Any) -> Look | None:
+    """What there is to see of a state of this task as it is set; None: where agents are, if that is known."""
+    return None if task.scene is None else partial(task.scene, settings)

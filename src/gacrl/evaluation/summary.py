@@ -1,5 +1,6 @@
-"""Numbers over seeds, and on the scale from random to oracle."""
+"""Numbers over seeds, and on the scale from random to the task's own reference."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,24 +24,33 @@ def _one(values: np.ndarray) -> dict[str, Any]:
 
 
 def normalised(
-    metrics: dict[str, dict[str, Any]], references: dict[str, dict[str, float]]
+    metrics: dict[str, dict[str, Any]],
+    references: dict[str, dict[str, float]],
+    scale: Sequence[str] | None,
 ) -> dict[str, dict[str, Any]]:
-    """The metrics, and for each a `score_` in which random is 0 and oracle is 1 (where the two differ)."""
+    """The metrics, and for each a `score_` in which one reference is 0 and another is 1, where the two differ.
 
-    def score(entry: dict[str, Any], low: float, high: float) -> dict[str, Any]:
-        def scale(value: float) -> float:
-            return (value - low) / (high - low)
-
-        interval = entry["interval"]
-        return {
-            "mean": scale(entry["mean"]),
-            "interval": None if interval is None else sorted(scale(bound) for bound in interval),
-            "values": [scale(value) for value in entry["values"]],
-        }
+    scale: their names; None: there are no scores.
+    """
+    if scale is None:
+        return metrics
+    low, high = (references[name] for name in scale)
 
     scores = {
-        f"score_{name}": score(entry, references["random"][name], references["oracle"][name])
+        f"score_{name}": _scaled(entry, low[name], high[name])
         for name, entry in metrics.items()
-        if references["random"][name] != references["oracle"][name]
+        if low[name] != high[name]
     }
     return {**metrics, **scores}
+
+
+def _scaled(entry: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    def scale(value: float) -> float:
+        return (value - low) / (high - low)
+
+    interval = entry["interval"]
+    return {
+        "mean": scale(entry["mean"]),
+        "interval": None if interval is None else sorted(scale(bound) for bound in interval),
+        "values": [scale(value) for value in entry["values"]],
+    }
