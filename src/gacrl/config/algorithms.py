@@ -1,14 +1,14 @@
 """The settings of the algorithms and of the network that they share: one frozen dataclass each.
 
-A leaf, as `config` is: it imports no jax. Every default has its home here; what the presets set is in `config`.
+Every default has its home here; what the presets set is in `presets`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
-from gacrl.config.checks import between, require
+from gacrl.config.checks import between, require, unknown
+from gacrl.config.kinds import COMMUNICATION, EXPLORATION
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,7 @@ class GacrlPaperConfig:
     """The paper's algorithm, as printed (docs/algorithm.md)."""
 
     name: ClassVar[str] = "gacrl_paper"
+    fixed_team: ClassVar[bool] = True
 
     learning_rate: float = 5e-4
     """Adam's step size at the start."""
@@ -93,8 +94,9 @@ class NetworkConfig:
     """A narrow code of what the agent sees, which its symbols are made of: none, a code, or a Gaussian."""
     latent_size: int = 16
     """Numbers of the code."""
-    communication: Literal["none", "commnet", "dial", "discrete", "soft"] = "none"
-    """CommNet's averages, DIAL's regularised units, or Gumbel-Softmax symbols: hard or soft."""
+    communication: str = "none"
+    """What agents send: none, commnet (averages of hidden states), dial (regularised units), discrete or soft
+    (Gumbel-Softmax symbols, one-hot when played or not), or a kind of your own (examples/own_messages.py)."""
     rounds: int = 1
     """Rounds of messages within a step (CommNet, symbols)."""
     vocabulary: int = 8
@@ -117,6 +119,8 @@ class NetworkConfig:
         between("algorithm.network", self, 0.0, 100.0, "dial_noise")
         between("algorithm.network", self, 0.0, 1e6, "radius")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")
+        kind = self.communication
+        require(kind in COMMUNICATION, unknown("algorithm.network.communication", kind, COMMUNICATION))
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,8 @@ class LearningConfig:
 
     learns_code: ClassVar[bool] = False
     """Whether there is a loss for the network's code."""
+    fixed_team: ClassVar[bool] = False
+    """Whether no agent may be absent, and no other number of agents can be played with."""
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning_rate: float = 1e-3
@@ -143,14 +149,37 @@ class LearningConfig:
     """Play greedily by the mean over the task's symmetries, eight for spread: eight times the messages."""
     reward: Literal["team", "own"] = "team"
     """Every agent earns the team's mean reward, or its own."""
+    exploration: str = "linear"
+    """The rule by which random actions and the temperature of messages fall: none (no random actions), linear in time,
+    fixed at their end, adaptive (as the task's progress rises), yoked (as the progress of another training rose), or
+    one of your own (examples/own_exploration.py)."""
+    epsilon: float = 1.0
+    """Share of random actions at the start, or while no progress is made."""
+    epsilon_end: float = 0.05
+    """And at the end, or when all is done."""
+    temperature: float = 1.0
+    """Gumbel-Softmax temperature of the symbols at the start, or while no progress is made."""
+    temperature_end: float = 1.0
+    """And at the end, or when all is done."""
+    exploration_steps: int = 50_000
+    """Environment steps over which both fall, where they follow time."""
+    greedy_share: float = 0.2
+    """Share of the training episodes that are played greedily, to see the progress that is made without exploring."""
+    yoked_progress: tuple[float, ...] = ()
+    """The progress to follow, at even spaces over the planned environment steps."""
 
     def __post_init__(self) -> None:
         between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "gamma")
         between("algorithm", self, 0, 1_000, "n_step")
         between("algorithm", self, 1e-6, 1e6, "max_grad_norm")
+        between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
+        between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
+        between("algorithm", self, 0, 1_000_000_000, "exploration_steps")
+        rule = self.exploration
+        require(rule in EXPLORATION, unknown("algorithm.exploration", rule, EXPLORATION))
         require(
-            not (self.symmetric_play and (self.network.recurrent or self.network.communication == "dial")),
-            "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network or DIAL",
+            all(0.0 <= progress <= 1.0 for progress in self.yoked_progress),
+            "algorithm.yoked_progress must be shares between 0 and 1",
         )
         require(
             self.network.latent == "none" or self.learns_code,
@@ -164,6 +193,7 @@ class PpoConfig(LearningConfig):
 
     n_step: int = 0
     """Rewards in a target before it bootstraps; 0 leaves it to gae_lambda."""
+    exploration: str = "none"
     gae_lambda: float = 0.95
     """Of generalised advantage estimation."""
     update_epochs: int = 6
@@ -206,6 +236,15 @@ class IppoConfig(PpoConfig):
 
 
 @dataclass(frozen=True)
+class CommnetConfig(PpoConfig):
+    """CommNet (Sukhbaatar et al. 2016): IPPO whose agents average each other's hidden states, in two rounds."""
+
+    name: ClassVar[str] = "commnet"
+
+    network: NetworkConfig = field(default_factory=lambda: NetworkConfig(communication="commnet", rounds=2))
+
+
+@dataclass(frozen=True)
 class QLearningConfig(LearningConfig):
     """Q-learning of a team from replay."""
 
@@ -240,25 +279,40 @@ class QLearningConfig(LearningConfig):
 
 @dataclass(frozen=True)
 class QmixConfig(QLearningConfig):
-    """QMIX, and with other mixers VDN and IQL."""
+    """QMIX (Rashid et al. 2018): the team's value is a monotonic network of the agents' values."""
 
     name: ClassVar[str] = "qmix"
 
-    mixer: Literal["qmix", "vdn", "iql"] = "qmix"
-    """A monotonic network of the agents' values, their sum, or each for itself."""
     mixer_width: int = 32
-    """Units of QMIX's mixing network."""
-    epsilon: float = 1.0
-    """Share of random actions at the start."""
-    epsilon_end: float = 0.05
-    epsilon_steps: int = 50_000
-    """Environment steps over which the share falls."""
+    """Units of the mixing network."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         between("algorithm", self, 1, 10_000, "mixer_width")
-        between("algorithm", self, 0, 1_000_000_000, "epsilon_steps")
-        between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end")
+
+
+@dataclass(frozen=True)
+class VdnConfig(QLearningConfig):
+    """VDN (Sunehag et al. 2018): the team's value is the sum of the agents' values."""
+
+    name: ClassVar[str] = "vdn"
+
+
+@dataclass(frozen=True)
+class IqlConfig(QLearningConfig):
+    """IQL (Tan 1993): each agent learns its value by itself."""
+
+    name: ClassVar[str] = "iql"
+
+
+@dataclass(frozen=True)
+class DialConfig(QLearningConfig):
+    """DIAL (Foerster et al. 2016): VDN through messages that are noisy units while learning and bits when played."""
+
+    name: ClassVar[str] = "dial"
+
+    network: NetworkConfig = field(default_factory=lambda: NetworkConfig(communication="dial", recurrent=True))
+    sequence_length: int = 8
 
 
 @dataclass(frozen=True)
@@ -272,46 +326,39 @@ class GacrlConfig(QLearningConfig):
     """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""
     latent_weight: float = 1e-3
     """Weight of the code's loss: reconstruction and KL divergence."""
-    exploration: Literal["adaptive", "linear", "fixed", "yoked"] = "adaptive"
-    """The level of exploration follows the coverage that greedy episodes reach, or time, or stays at its end, or
-    follows the coverage of another training."""
-    yoked_coverage: tuple[float, ...] = ()
-    """That coverage, at even spaces over the planned environment steps."""
-    epsilon: float = 1.0
-    """Share of random actions while nothing is covered."""
-    epsilon_end: float = 0.05
-    """And when everything is."""
+    exploration: str = "adaptive"
     temperature: float = 2.0
-    """Gumbel-Softmax temperature of the symbols while nothing is covered."""
     temperature_end: float = 0.5
-    """And when everything is."""
     exploration_steps: int = 12_000
-    """Environment steps over which the levels fall, where they follow time."""
-    greedy_share: float = 0.2
-    """Share of the training episodes that are played greedily, to see what is covered without exploring."""
-    coverage_radius: Literal["0.1", "0.2", "0.5"] = "0.2"
-    """Radius of the coverage that exploration follows."""
     averaged: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         between("algorithm", self, 0.0, 1e6, "latent_weight")
-        between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
-        between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
-        between("algorithm", self, 1, 1_000_000_000, "exploration_steps")
-        require(
-            all(0.0 <= coverage <= 1.0 for coverage in self.yoked_coverage),
-            "algorithm.yoked_coverage must be shares between 0 and 1",
-        )
-        require(
-            self.exploration != "yoked" or len(self.yoked_coverage) > 0,
-            "algorithm.exploration yoked needs the coverage to follow, in algorithm.yoked_coverage",
-        )
 
 
-AlgorithmConfig: TypeAlias = GacrlPaperConfig | GacrlConfig | MappoConfig | IppoConfig | QmixConfig
-"""Any algorithm's settings."""
+AlgorithmConfig: TypeAlias = Any
+"""Any algorithm's settings: a frozen dataclass with a `name`."""
 
-ALGORITHMS: Mapping[str, type[AlgorithmConfig]] = MappingProxyType(
-    {kind.name: kind for kind in (GacrlPaperConfig, GacrlConfig, MappoConfig, IppoConfig, QmixConfig)}
-)
+
+class Kind(NamedTuple):
+    """An algorithm that can be chosen by name."""
+
+    settings: type
+    """A frozen dataclass; usually a `LearningConfig`."""
+    make: str | Callable[..., Any]
+    """(settings, environment, TrainingConfig, measure of progress) -> Algorithm; or where that function is."""
+
+
+ALGORITHMS: dict[str, Kind] = {
+    "gacrl_paper": Kind(GacrlPaperConfig, "gacrl.algorithms.gacrl_paper:make"),
+    "gacrl": Kind(GacrlConfig, "gacrl.algorithms.gacrl:make"),
+    "mappo": Kind(MappoConfig, "gacrl.algorithms.mappo:make"),
+    "ippo": Kind(IppoConfig, "gacrl.algorithms.ippo:make"),
+    "commnet": Kind(CommnetConfig, "gacrl.algorithms.commnet:make"),
+    "qmix": Kind(QmixConfig, "gacrl.algorithms.qmix:make"),
+    "vdn": Kind(VdnConfig, "gacrl.algorithms.vdn:make"),
+    "iql": Kind(IqlConfig, "gacrl.algorithms.iql:make"),
+    "dial": Kind(DialConfig, "gacrl.algorithms.dial:make"),
+}
+"""One line adds another (examples/own_algorithm.py)."""

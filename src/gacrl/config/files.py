@@ -8,36 +8,57 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from gacrl import tasks
 from gacrl.config.algorithms import ALGORITHMS
 from gacrl.config.checks import require, unknown
+from gacrl.config.former import converted
 from gacrl.config.presets import DEFAULT_PRESET, preset
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, reason
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """The settings as plain data, complete; the algorithm's name stands among its settings."""
+    """The settings as plain data, complete; the names of algorithm and task stand among their settings."""
     data = dataclasses.asdict(config)
-    return {**data, "algorithm": {"name": config.algorithm.name, **data["algorithm"]}}
+    task = data.pop("task")
+    return {
+        **data,
+        "algorithm": {"name": config.algorithm.name, **data["algorithm"]},
+        "env": {"name": task, **data["env"]},
+    }
 
 
 def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConfig:
     """Settings from plain data over a base (the preset that the data names, else the default one).
 
-    Raises ConfigError for an unknown key (with the nearest known one) or a value of the wrong type.
+    Raises ConfigError for an unknown key (with the nearest known one), a value of the wrong type, or a task that is
+    not at hand.
     """
     named = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
     base = named if base is None else base
-    data = dict(data)
+    data = converted(data)
     if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
         settings = dict(data["algorithm"])
         name = _text(settings.pop("name"), "algorithm.name")
         if name not in ALGORITHMS:
             raise ConfigError(unknown("algorithm", name, ALGORITHMS))
         if name != base.algorithm.name:
-            base = replace(base, algorithm=ALGORITHMS[name]())
+            base = replace(base, algorithm=ALGORITHMS[name].settings())
         data["algorithm"] = settings
+    if isinstance(data.get("env"), Mapping) and "name" in data["env"]:
+        settings = dict(data["env"])
+        base = on_task(base, _text(settings.pop("name"), "env.name"))
+        data["env"] = settings
     return _merge(base, data, "")
+
+
+def on_task(config: RunConfig, name: str) -> RunConfig:
+    """The same on another task, with that one's own settings; as it is where the task is the same.
+
+    Raises ConfigError for a task that is not at hand.
+    """
+    settings = tasks.default_settings(name)
+    return config if name == config.task else replace(config, task=name, env=settings)
 
 
 def load(path: Path, base: RunConfig | None = None) -> RunConfig:
@@ -85,7 +106,7 @@ def _text(value: Any, where: str) -> str:
 def _merge(settings: Any, data: Mapping[str, Any], where: str) -> Any:
     """`settings`, a dataclass, with the values that `data` names."""
     hints = get_type_hints(type(settings))
-    fields = {f.name for f in dataclasses.fields(settings)}
+    fields = {f.name for f in dataclasses.fields(settings)} - {"task"}
     changes: dict[str, Any] = {}
     for key, value in data.items():
         if key not in fields:

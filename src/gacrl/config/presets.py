@@ -1,28 +1,33 @@
-"""The presets: settings that work, by name. A leaf: it imports no jax."""
+"""The presets: settings that work, by name."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from gacrl.config.algorithms import (
     AlgorithmConfig,
+    CommnetConfig,
+    DialConfig,
     GacrlConfig,
     GacrlPaperConfig,
     IppoConfig,
+    IqlConfig,
     MappoConfig,
     NetworkConfig,
     PpoConfig,
+    QLearningConfig,
     QmixConfig,
+    VdnConfig,
 )
 from gacrl.config.checks import unknown
-from gacrl.config.run import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.errors import ConfigError
+from gacrl.tasks.spread.settings import SpreadSettings
 
 _PAPER = RunConfig(
     algorithm=GacrlPaperConfig(),
-    env=EnvConfig(max_cycles=75, reward="paper"),
-    curriculum=CurriculumConfig(local_ratio_end=0.1, coverage_threshold_end=0.2),
+    env=SpreadSettings(max_cycles=75, reward="paper", local_ratio_end=0.1, coverage_threshold_end=0.2),
     training=TrainingConfig(env_steps=112_500),
     evaluation=EvaluationConfig(interval=50 * 75),
     preset="paper",
@@ -53,11 +58,10 @@ def _ppo(kind: type[PpoConfig], **network: Any) -> Any:
     )
 
 
-def _q(mixer: Literal["qmix", "vdn", "iql"], sequence_length: int = 1, **network: Any) -> QmixConfig:
+def _q(kind: type[QLearningConfig], sequence_length: int = 1, **network: Any) -> Any:
     """The tuned Q-learning of docs/results.md."""
-    return QmixConfig(
+    return kind(
         network=NetworkConfig(**network),
-        mixer=mixer,
         n_step=3,
         updates=16,
         reward_norm=True,
@@ -70,11 +74,11 @@ _ON_POLICY = TrainingConfig(env_steps=2_500_000, num_envs=64, num_steps=25)
 _OFF_POLICY = TrainingConfig(env_steps=1_000_000, num_envs=32, num_steps=8)
 _MAPPO = _baseline("mappo", _ppo(MappoConfig), _ON_POLICY)
 _IPPO = _baseline("ippo", _ppo(IppoConfig), _ON_POLICY)
-_QMIX = _baseline("qmix", _q("qmix"), _OFF_POLICY)
-_VDN = _baseline("vdn", _q("vdn"), _OFF_POLICY)
-_IQL = _baseline("iql", _q("iql"), _OFF_POLICY)
-_COMMNET = _baseline("commnet", _ppo(IppoConfig, communication="commnet", rounds=2), _ON_POLICY)
-_DIAL = _baseline("dial", _q("vdn", 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
+_QMIX = _baseline("qmix", _q(QmixConfig), _OFF_POLICY)
+_VDN = _baseline("vdn", _q(VdnConfig), _OFF_POLICY)
+_IQL = _baseline("iql", _q(IqlConfig), _OFF_POLICY)
+_COMMNET = _baseline("commnet", _ppo(CommnetConfig, communication="commnet", rounds=2), _ON_POLICY)
+_DIAL = _baseline("dial", _q(DialConfig, 8, communication="dial", recurrent=True, width=64), _OFF_POLICY)
 
 
 GACRL_PARAMETERS = 12_101
@@ -98,7 +102,7 @@ _LEARNER: dict[str, Any] = {
 """Q-learning where environment steps are dear: an update of ten gradient steps after every 25 of them."""
 
 
-def _dear(name: str, algorithm: AlgorithmConfig, env: EnvConfig, training: TrainingConfig) -> RunConfig:
+def _dear(name: str, algorithm: AlgorithmConfig, env: SpreadSettings, training: TrainingConfig) -> RunConfig:
     """Few environment steps, rewarded with the coverage bonus."""
     env, evaluation = replace(env, reward="coverage"), EvaluationConfig(interval=7_500)
     return RunConfig(algorithm=algorithm, env=env, training=training, evaluation=evaluation, preset=name)
@@ -107,19 +111,19 @@ def _dear(name: str, algorithm: AlgorithmConfig, env: EnvConfig, training: Train
 _GACRL_NETWORK = NetworkConfig(torso="graph", width=32, latent="vae", communication="discrete", rounds=2)
 
 
-def _gacrl(name: str, env: EnvConfig, env_steps: int = 112_500, **changes: Any) -> RunConfig:
-    """GACRL as docs/design.md came to it."""
+def _gacrl(name: str, env: SpreadSettings, env_steps: int = 112_500, **changes: Any) -> RunConfig:
+    """GACRL as docs/log.md came to it."""
     settings: dict[str, Any] = {"network": _GACRL_NETWORK, **_LEARNER, **changes}
     training = TrainingConfig(env_steps=env_steps, num_envs=25, num_steps=1)
     return _dear(name, GacrlConfig(**settings), env, training)
 
 
-_GACRL = _gacrl("gacrl", EnvConfig(), env_steps=150_000)
-_GACRL_112K = _gacrl("gacrl-112k", EnvConfig(max_cycles=75))
+_GACRL = _gacrl("gacrl", SpreadSettings(), env_steps=150_000)
+_GACRL_112K = _gacrl("gacrl-112k", SpreadSettings(max_cycles=75))
 # Entities as dense as in the standard task: the arena's side grows with the root of their number.
 _GACRL_TEAMS = _gacrl(
     "gacrl-teams",
-    EnvConfig(num_agents=5, arena_scale=1.291, max_cycles=75),
+    SpreadSettings(num_agents=5, arena_scale=1.291, max_cycles=75),
     env_steps=150_000,
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
@@ -129,18 +133,18 @@ _GACRL_TEAMS = _gacrl(
 _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
 
 
-def _graph_q(name: str, mixer: Literal["qmix", "vdn"]) -> RunConfig:
-    algorithm = QmixConfig(network=_GRAPH, mixer=mixer, epsilon_steps=13_000, **_LEARNER)
-    return _dear(name, algorithm, EnvConfig(), _GACRL.training)
+def _graph_q(name: str, kind: type[QLearningConfig]) -> RunConfig:
+    algorithm = kind(network=_GRAPH, exploration_steps=13_000, **_LEARNER)
+    return _dear(name, algorithm, SpreadSettings(), _GACRL.training)
 
 
 def _graph_ppo(name: str, kind: type[PpoConfig], **tuned: Any) -> RunConfig:
     algorithm = replace(_ppo(kind), network=_GRAPH, **_SYMMETRY, **tuned)
-    return _dear(name, algorithm, EnvConfig(), replace(_GACRL.training, num_envs=10, num_steps=25))
+    return _dear(name, algorithm, SpreadSettings(), replace(_GACRL.training, num_envs=10, num_steps=25))
 
 
-_GRAPH_VDN = _graph_q("graph-vdn", "vdn")
-_GRAPH_QMIX = _graph_q("graph-qmix", "qmix")
+_GRAPH_VDN = _graph_q("graph-vdn", VdnConfig)
+_GRAPH_QMIX = _graph_q("graph-qmix", QmixConfig)
 _GRAPH_MAPPO = _graph_ppo(
     "graph-mappo", MappoConfig, learning_rate=2.3e-3, update_epochs=4, num_minibatches=5, gamma=0.97
 )
