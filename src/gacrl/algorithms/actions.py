@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from gacrl.envs.environment import Environment, SpatialEnvironment
+from gacrl.envs.environment import Environment
 
 STRENGTHS = (1.0, 0.5, 0.25)
 
@@ -31,21 +31,15 @@ class ActionSet(NamedTuple):
 
 def choices(env: Environment) -> ActionSet:
     """What the agents of this task choose among."""
-    spatial = env if isinstance(env, SpatialEnvironment) else None
     if not env.continuous_actions:
-        turn = (lambda choice, symmetry: choice) if spatial is None else spatial.turn_action
-        return ActionSet(env.num_actions, lambda choice: choice, turn, lambda mask: mask)
+        return ActionSet(env.num_actions, lambda choice: choice, env.turn_action, lambda mask: mask)
 
     table = np.concatenate([np.eye(env.num_actions)[:1], *[s * np.eye(env.num_actions)[1:] for s in STRENGTHS]])
-    if spatial is None:
-        becomes = np.arange(len(table))[None]
-    else:
-        with jax.ensure_compile_time_eval():  # also where a program that uses it is being traced
-            turned = [
-                np.asarray(spatial.turn_action(jnp.asarray(table), jnp.asarray(g)))
-                for g in range(spatial.num_symmetries)
-            ]
-        becomes = np.stack([np.abs(rows[:, None] - table).sum(-1).argmin(-1) for rows in turned])
+    with jax.ensure_compile_time_eval():  # also where a program that uses it is being traced
+        turned = [
+            np.asarray(env.turn_action(jnp.asarray(table), jnp.asarray(g))) for g in range(env.num_symmetries)
+        ]
+    becomes = np.stack([np.abs(rows[:, None] - table).sum(-1).argmin(-1) for rows in turned])
     return ActionSet(
         size=len(table),
         act=lambda choice: jnp.asarray(table, jnp.float32)[choice],

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import actions
-from gacrl.envs.environment import Environment, SpatialEnvironment
+from gacrl.config.algorithms import LearningConfig
+from gacrl.config.checks import require
+from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput
 from gacrl.types import Channel, Memory, Observation, PRNGKey, Transition
 
@@ -18,7 +20,7 @@ def turn_experience(env: Environment, steps: Transition, key: PRNGKey) -> Transi
 
     The decisions' actions are indices of `actions.choices`. A task without symmetries gives its steps back.
     """
-    if not isinstance(env, SpatialEnvironment):
+    if env.num_symmetries == 1:
         return steps
     choices = actions.choices(env)
     symmetries = jax.random.randint(key, (steps.first.shape[1],), 0, env.num_symmetries)
@@ -49,7 +51,7 @@ def play(
     when the world turns the actions do. Every turned world has a conversation of its own: all that is computed and
     sent grows by the number of symmetries. The message shown is the one of the world as it is.
     """
-    if not symmetric or not isinstance(env, SpatialEnvironment):
+    if not symmetric or env.num_symmetries == 1:
         return network(observation, memory, None, channel, temperature)
     choices = actions.choices(env)
 
@@ -59,3 +61,12 @@ def play(
 
     outputs = jax.vmap(turned)(jnp.arange(env.num_symmetries))
     return jax.tree.map(lambda leaf: leaf[0], outputs)._replace(head=outputs.head.mean(0)), memory
+
+
+def require_no_memory_in_symmetric_play(config: LearningConfig, env: Environment, memory: Memory) -> None:
+    """Raises ConfigError where a network that remembers is to play by the mean over turned worlds."""
+    require(
+        not (config.symmetric_play and env.num_symmetries > 1 and jax.tree.leaves(memory)),
+        "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network, or with "
+        f"messages that are heard a step later ({config.network.communication})",
+    )

@@ -1,32 +1,18 @@
 """From an algorithm's settings to its functions."""
 
-from collections.abc import Callable
-from typing import Any
-
-from gacrl.algorithms import gacrl, gacrl_paper, ippo, mappo, qmix
 from gacrl.algorithms.contract import Algorithm
-from gacrl.config.algorithms import (
-    AlgorithmConfig,
-    GacrlConfig,
-    GacrlPaperConfig,
-    IppoConfig,
-    MappoConfig,
-    QmixConfig,
-)
+from gacrl.config.algorithms import ALGORITHMS, AlgorithmConfig
+from gacrl.config.kinds import resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 
 
-def make(config: AlgorithmConfig, env: Environment, training: TrainingConfig) -> Algorithm:
+def make(
+    config: AlgorithmConfig, env: Environment, training: TrainingConfig, progress: str | None = None
+) -> Algorithm:
     """Build the algorithm that the configuration names, for the shapes of this task.
 
-    training: its planned length is what schedules run over; how experience is gathered shapes a replay.
+    training: its planned length is what schedules run over; how experience is gathered shapes a replay. progress: the
+    task's measure that exploration may follow.
     """
-    builders: dict[type[AlgorithmConfig], Callable[[Any, Environment, TrainingConfig], Algorithm]] = {
-        GacrlPaperConfig: gacrl_paper.make,
-        GacrlConfig: gacrl.make,
-        MappoConfig: mappo.make,
-        IppoConfig: ippo.make,
-        QmixConfig: qmix.make,
-    }
-    return builders[type(config)](config, env, training)
+    return resolve(ALGORITHMS[config.name].make)(config, env, training, progress)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
+from gacrl.algorithms.replay import Replay
 from gacrl.types import Learner, Memory, Metrics, Policy, PRNGKey, Rollout
 
 Hyper: TypeAlias = Any
@@ -10,10 +11,13 @@ Hyper: TypeAlias = Any
 
 
 class Algorithm(NamedTuple):
-    """A record of pure functions, as `optax.GradientTransformation` is."""
+    """A record of pure functions, as `optax.GradientTransformation` is.
+
+    A learner is opaque to everyone else: what is asked of it, the record says.
+    """
 
     init: Callable[[PRNGKey, Hyper], Learner]
-    """Parameters, optimiser, replay, exploration and hyper, in a pytree that is opaque to the loop."""
+    """Parameters, optimiser, replay, exploration and hyper, in a pytree of named tuples."""
     initial_memory: Callable[[int], Memory]
     """The policy's memory for this many agents: () when feed-forward."""
     policy: Callable[[Learner, bool], Policy]
@@ -22,3 +26,17 @@ class Algorithm(NamedTuple):
     """Learn from a rollout [T, E, …]. The same metrics at every call, all scalars."""
     hyper: Hyper
     """The configured numbers, to hand to `init` as they are or varied."""
+    acting: Callable[[Learner], Learner] = lambda learner: learner
+    """The same learner without what only learning needs, () in its place: `policy` takes it as well."""
+    parameters: Callable[[Learner], Any] = lambda learner: learner
+    """The numbers that are learned."""
+    learned: Callable[[Learner], Learner] = lambda learner: learner
+    """The same learner with no more than another training can start from, () in place of the rest."""
+    replay: Callable[[Learner], Replay[Any] | None] = lambda learner: None
+    """What it remembers of past experience; None for one that learns on-policy."""
+    batch_steps: int = 0
+    """Remembered steps that a gradient step takes out of the replay."""
+    splits_envs: bool = False
+    """Whether the environments of a seed may be spread over several devices."""
+    compiled_for_speed: bool = True
+    """Whether its program is optimised as far as the compiler can, or compiled quickly where that runs as fast."""

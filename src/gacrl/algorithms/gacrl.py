@@ -5,7 +5,7 @@
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
   learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
   actions stays each agent's own argmax, so that execution is decentralised.
-- Exploration that adapts to coverage (13) to (16): `exploration.adaptive`.
+- Exploration that adapts to progress, on `spread` coverage, (13) to (16): `exploration.adaptive`.
 """
 
 from functools import partial
@@ -14,13 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from gacrl.algorithms import exploration, q_learning
+from gacrl.algorithms import q_learning
 from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.exploration import Exploration
-from gacrl.algorithms.q_learning import Network, Parts
-from gacrl.algorithms.qmix import summed
+from gacrl.algorithms.q_learning import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
+from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import GacrlConfig
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
@@ -45,8 +44,10 @@ def central(
     return value + jnp.where(observation.agent_mask, shortfall, 0.0).sum()
 
 
-def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Algorithm:
-    """The learner for this task's shapes."""
+def make(
+    config: GacrlConfig, env: Environment, training: TrainingConfig, progress: str | None = None
+) -> Algorithm:
+    """The learner for this task's shapes. progress: the task's measure that exploration follows."""
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
     width = settings.width
@@ -58,27 +59,16 @@ def make(config: GacrlConfig, env: Environment, training: TrainingConfig) -> Alg
             return Network(agent, ())
         return Network(agent, (Mlp(width, (width,), layers_key), Linear(width, 1, head_key)))
 
-    def auxiliary(output: AgentOutput) -> Metrics:
+    def auxiliary(output: AgentOutput, observation: Observation) -> Metrics:
         if settings.latent == "none":
-            return {}
-        return {"loss_code": config.latent_weight * jnp.mean(output.code_loss)}
+            return message_loss(output, observation)
+        code = {"loss_code": config.latent_weight * jnp.mean(output.code_loss)}
+        return {**code, **message_loss(output, observation)}
 
     parts = Parts(
         networks=networks,
         team_value=partial(central, actions) if config.critic == "central" else summed,
-        exploration=_exploration(config, training.env_steps),
         auxiliary=auxiliary,
     )
-    return q_learning.make(config, env, training, parts)
-
-
-def _exploration(config: GacrlConfig, planned_steps: int) -> Exploration:
-    epsilon, temperature = (config.epsilon, config.epsilon_end), (config.temperature, config.temperature_end)
-    if config.exploration in ("adaptive", "yoked"):
-        recorded = config.yoked_coverage if config.exploration == "yoked" else ()
-        measure = f"coverage_{config.coverage_radius}"
-        return exploration.adaptive(epsilon, temperature, config.greedy_share, measure, recorded, planned_steps)
-    if config.exploration == "fixed":
-        epsilon = (config.epsilon_end, config.epsilon_end)
-        temperature = (config.temperature_end, config.temperature_end)
-    return exploration.linear(epsilon, config.exploration_steps, temperature)
+    learner = q_learning.make(config, env, training, progress, parts)
+    return learner._replace(compiled_for_speed=False)  # as quick when quickly compiled (docs/design.md)

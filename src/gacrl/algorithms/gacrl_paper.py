@@ -1,8 +1,9 @@
 """GACRL exactly as the paper prints it: equations (2) to (20), read as docs/algorithm.md says.
 
 Top to bottom: the networks (2)–(12), how agents act (9)–(16), the loss (17)–(20), one update.
-Equation (1) is in `envs.shaping`, the encoder (2)–(3) in `networks.encoder`, the graph (4) and (7) in
-`networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in `exploration`.
+Equation (1) is in `tasks.spread.shaping`, the encoder (2)–(3) in `networks.encoder`, the graph (4) and (7) in
+`networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in
+`gacrl_paper_exploration`.
 """
 
 from math import prod
@@ -25,6 +26,7 @@ from gacrl.algorithms.gacrl_paper_exploration import (
     no_coverage,
 )
 from gacrl.config.algorithms import GacrlPaperConfig
+from gacrl.config.checks import require
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
@@ -302,11 +304,21 @@ def loss(
     return total, parts
 
 
-def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | None = None) -> Algorithm:
-    """The paper's algorithm for this task's shapes. Needs discrete actions and a team without padding.
+def make(
+    config: GacrlPaperConfig,
+    env: Environment,
+    training: TrainingConfig | None = None,
+    progress: str | None = None,
+) -> Algorithm:
+    """The paper's algorithm for this task's shapes.
 
-    training: not looked at; the paper's schedules count episodes.
+    training: not looked at; the paper's schedules count episodes. progress: what (13) and (14) follow in a task that
+    has no coverage within θ. Raises ConfigError for continuous actions.
     """
+    require(
+        not env.continuous_actions,
+        f"{config.name} needs discrete actions: leave env.continuous_actions at False, or take another preset",
+    )
     num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
     straight_through = config.messages == "straight_through"
     adam = optax.flatten(optax.scale_by_adam())  # one vector: a kernel for each of 28 arrays costs more
@@ -321,6 +333,7 @@ def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | 
         kl_weight=config.kl_weight,
     )
 
+    followed = ("coverage_theta",) if progress is None else ("coverage_theta", progress)
     packed_size, unpack = ring.packing(lambda: no_experience(num_agents, observation_size))
 
     def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
@@ -428,7 +441,7 @@ def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | 
                 )
                 metrics = jax.tree.map(lambda values: values.mean(0), metrics)
             done = steps.terminated | steps.truncated
-            coverage = steps.info.get("coverage_theta", jnp.zeros(done.shape))
+            coverage = next((steps.info[name] for name in followed if name in steps.info), jnp.zeros(done.shape))
             return learner._replace(coverage=follow_coverage(learner.coverage, coverage, done)), metrics
 
         single = time * environments == 1
@@ -438,4 +451,15 @@ def make(config: GacrlPaperConfig, env: Environment, training: TrainingConfig | 
         learner, metrics = jax.lax.scan(learn_from_steps, learner, (rollout.transitions, keys))
         return learner, jax.tree.map(lambda values: values.mean(0), metrics)
 
-    return Algorithm(init, lambda num_agents: (), policy, update, hyper)
+    return Algorithm(
+        init=init,
+        initial_memory=lambda num_agents: (),
+        policy=policy,
+        update=update,
+        hyper=hyper,
+        acting=lambda learner: learner._replace(optimizer=(), replay=()),
+        parameters=lambda learner: learner.network,
+        learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[1:], ())),
+        replay=lambda learner: learner.replay,
+        batch_steps=config.batch_size,
+    )

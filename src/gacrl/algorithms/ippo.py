@@ -7,6 +7,6 @@ from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 
 
-def make(config: IppoConfig, env: Environment, training: TrainingConfig) -> Algorithm:
+def make(config: IppoConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
     """PPO with a critic for each agent."""
-    return ppo.make(config, env, training, view="local")
+    return ppo.make(config, env, training, progress, view="local")

@@ -7,6 +7,8 @@ from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 
 
-def make(config: MappoConfig, env: Environment, training: TrainingConfig) -> Algorithm:
+def make(
+    config: MappoConfig, env: Environment, training: TrainingConfig, progress: str | None = None
+) -> Algorithm:
     """PPO with a central critic."""
-    return ppo.make(config, env, training, view="central")
+    return ppo.make(config, env, training, progress, view="central")

@@ -1,8 +1,11 @@
 """Proximal policy optimisation of a team that shares its weights (Schulman et al. 2017; Yu et al. 2022).
 
-Top to bottom: how agents act, targets, the loss, one update. MAPPO and IPPO pass the view of their critic.
+Top to bottom: how agents act, targets, the loss, one update. MAPPO, IPPO and CommNet pass the view of their critic.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,18 +14,26 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gacrl.algorithms.actions import choices
-from gacrl.algorithms.augmentation import play, turn_experience
+from gacrl.algorithms.actions import ActionSet, choices
+from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.exploration import progress_between
-from gacrl.algorithms.objectives import ValueNorm, clipped_surrogate, follow_returns, huber, no_returns
+from gacrl.algorithms.exploration import Exploration, Level, progress_between
+from gacrl.algorithms.objectives import (
+    ValueNorm,
+    clipped_surrogate,
+    follow_returns,
+    huber,
+    no_returns,
+)
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, sum_over_devices, taken
-from gacrl.config.algorithms import PpoConfig
+from gacrl.config.algorithms import NetworkConfig, PpoConfig
+from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
 from gacrl.networks.critic import Critic, View
+from gacrl.networks.memory import beginnings, restarted
 from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
 
@@ -32,10 +43,11 @@ class Network(eqx.Module):
 
 
 class PpoMemory(NamedTuple):
-    """What actor and critic carry; () for a feed-forward network."""
+    """What actor and critic carry, and what exploration settled; () for a feed-forward network without a rule."""
 
     actor: Memory
     critic: Memory
+    exploration: Any = ()
 
 
 class Hyper(NamedTuple):
@@ -59,13 +71,15 @@ class LearnerState(NamedTuple):
     norm: ValueNorm
     updates: Int[Array, ""]
     hyper: Hyper
+    exploration: Any = ()
 
 
 class Sample(NamedTuple):
     """Segments of a rollout to learn from, [L, B, …]: L steps that follow each other, B of them."""
 
     observation: Observation
-    first: Bool[Array, "L B"]
+    first: Bool[Array, "L B ..."]
+    """Before which steps memories begin anew; [L, B, N] where lives end inside episodes."""
     action: Int[Array, "L B N"]
     key: Key[Array, "L B"]
     """What the agents drew with: the loss draws the same again, so that the first ratio is 1."""
@@ -73,6 +87,105 @@ class Sample(NamedTuple):
     advantage: Float[Array, "L B N"]
     target: Float[Array, "L B N"]
     """Of the critic, in normalised units."""
+    epsilon: Float[Array, "L B"] | None = None
+    """Share of random actions among those taken; None for none."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is settled before anything is learned: constants of every function below."""
+
+    config: PpoConfig
+    env: Environment
+    actions: ActionSet
+    settings: NetworkConfig
+    view: View
+    explorer: Exploration
+    adam: optax.GradientTransformation
+    steps_per_update: int
+
+
+def make(
+    config: PpoConfig, env: Environment, training: TrainingConfig, progress: str | None, view: View
+) -> Algorithm:
+    """PPO for this task's shapes, with the critic's view. progress: the measure that exploration may follow."""
+    actions = choices(env)
+    explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
+    per_update = training.num_envs * training.num_steps
+    p = Setup(
+        config=config,
+        env=env,
+        actions=actions,
+        settings=matched(env, config.network, actions.size),
+        view=view,
+        explorer=explore(config, training.env_steps, progress),
+        adam=clipped_adam(config.max_grad_norm, eps=1e-5),
+        steps_per_update=per_update,
+    )
+    require_no_memory_in_symmetric_play(config, env, initial_memory(p, env.num_agents))
+    return Algorithm(
+        init=partial(init, p),
+        initial_memory=partial(initial_memory, p),
+        policy=partial(policy, p),
+        update=partial(update, p),
+        hyper=Hyper(
+            learning_rate=config.learning_rate,
+            learning_rate_end=config.learning_rate_end,
+            ent_coef=config.ent_coef,
+            ent_coef_end=config.ent_coef_end,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_eps=config.clip_eps,
+            vf_coef=config.vf_coef,
+            planned_updates=max(1.0, training.env_steps / per_update),
+        ),
+        acting=lambda learner: learner._replace(optimizer=()),
+        parameters=lambda learner: learner.network,
+        learned=lambda learner: learner._replace(optimizer=(), updates=(), hyper=(), exploration=()),
+        splits_envs=True,
+    )
+
+
+def networks(p: Setup, key: PRNGKey) -> Network:
+    """Actor and critic, orthogonal."""
+    actor_key, critic_key = jax.random.split(key)
+    gain = 2**0.5
+    return Network(
+        AgentNetwork(p.env, p.settings, p.actions.size, actor_key, gain, head_gain=0.01),
+        Critic(p.env, p.settings, p.view, critic_key, gain),
+    )
+
+
+def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
+    """A learner that has learned nothing."""
+    network = networks(p, key)
+    return LearnerState(
+        network=network,
+        optimizer=p.adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
+        norm=no_returns(),
+        updates=jnp.zeros((), jnp.int32),
+        hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
+        exploration=p.explorer.init(),
+    )
+
+
+def initial_memory(p: Setup, num_agents: int) -> Memory:
+    """The policy's memory at an episode's start; () where there is none."""
+    network = eqx.filter_eval_shape(partial(networks, p), jax.random.key(0))
+    memories = network.actor.initial_memory(num_agents), network.critic.initial_memory(num_agents)
+    memory = PpoMemory(*memories, p.explorer.initial_memory)
+    return memory if jax.tree.leaves(memory) else ()
+
+
+def split_memory(memory: Memory) -> PpoMemory:
+    """A policy's memory as actor's and critic's."""
+    return memory if isinstance(memory, PpoMemory) else PpoMemory((), ())
+
+
+def level_of(p: Setup, learner: LearnerState) -> Level:
+    """How much is explored until the next update."""
+    env_steps = learner.updates * p.steps_per_update if p.explorer.moves else learner.updates
+    return p.explorer.level(learner.exploration, env_steps)
 
 
 def log_policy(logits: Float[Array, "*b A"], action_mask: Bool[Array, "*b A"]) -> Float[Array, "*b A"]:
@@ -80,10 +193,98 @@ def log_policy(logits: Float[Array, "*b A"], action_mask: Bool[Array, "*b A"]) -
     return jax.nn.log_softmax(jnp.where(action_mask, logits, -jnp.inf))
 
 
+def explores(epsilon: Float[Array, "..."] | float) -> bool:
+    """Whether there may be random actions: False for a plain 0, which costs nothing."""
+    return not (isinstance(epsilon, float) and epsilon == 0.0)
+
+
+def mixed(log_probs: Float[Array, "*b A"], epsilon: Float[Array, "*#b"] | float | None) -> Float[Array, "*b A"]:
+    """What is acted by: (1 − ε) π + ε · uniform over the available actions; π itself for no ε."""
+    if epsilon is None or not explores(epsilon):
+        return log_probs
+    available = log_probs > -jnp.inf
+    uniform = available / available.sum(-1, keepdims=True)
+    share = jnp.asarray(epsilon)
+    share = share[..., None] if share.ndim else share
+    probs = jnp.where(available, jnp.exp(jnp.where(available, log_probs, 0.0)), 1.0)  # finite gradients everywhere
+    return jnp.where(available, jnp.log((1.0 - share) * probs + share * uniform), -jnp.inf)
+
+
 def entropy(log_probs: Float[Array, "*b A"]) -> Float[Array, "*b"]:
     """Of categorical distributions, in nats; actions with probability 0 count nothing."""
     probs = jnp.exp(log_probs)
     return -(probs * jnp.where(probs > 0, log_probs, 0.0)).sum(-1)
+
+
+def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
+    """Sampled from π, among random actions where the rule of exploration has some; or greedy."""
+    level = level_of(p, learner)
+
+    def act(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel) -> tuple[Decision, Memory]:
+        actor_memory, critic_memory, mode = split_memory(memory)
+        talk_key, choice_key = jax.random.split(key)
+        actor, temperature, extras = learner.network.actor, level.temperature, {}
+        if explore:
+            output, actor_memory = actor(observation, actor_memory, talk_key, channel, temperature)
+        else:
+            symmetric = p.config.symmetric_play
+            output, actor_memory = play(p.env, symmetric, actor, observation, actor_memory, channel, temperature)
+        log_probs = log_policy(output.head, p.actions.mask(observation.action_mask))
+        if explore:
+            settles = jax.tree.leaves(mode)  # where nothing does, nothing is drawn for it
+            mode_key = jax.random.fold_in(choice_key, 1) if settles else choice_key
+            mode, epsilon = p.explorer.begin(mode, mode_key, level.epsilon)
+            log_probs = mixed(log_probs, epsilon)
+            extras = {"epsilon": jnp.asarray(epsilon)} if explores(epsilon) else {}
+        choice = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
+        value, critic_memory = learner.network.critic(observation, critic_memory)
+        extras |= {
+            "value": learner.norm.denormalise(value),
+            "choice": choice,
+            "log_prob": taken(log_probs, choice),
+            "key": talk_key,
+            "mode": mode,
+        }
+        decision = Decision(p.actions.act(choice), output.message, output.adjacency, extras)
+        return decision, PpoMemory(actor_memory, critic_memory, mode) if memory else ()
+
+    return act
+
+
+def targets(
+    p: Setup, learner: LearnerState, steps: Transition, memory: PpoMemory
+) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
+    """Advantages and returns of every agent, in the units of the reward."""
+    critic, value = learner.network.critic, steps.decision.extras["value"]
+
+    def after(steps: Transition, memory: Memory, value: Float[Array, "T N"]) -> Float[Array, "T N"]:
+        memories = ()
+        if critic.memory is not None:
+            memories = critic.unroll(steps.observation, beginnings(steps.first, steps.left), memory)[1]
+            if steps.left is not None:
+                fresh = critic.initial_memory(p.env.num_agents)
+                memories = jax.vmap(restarted, (None, 0, 0))(fresh, memories, steps.left)
+
+        def anew(at: Int[Array, " K"]) -> Float[Array, "K N"]:
+            seen, before = jax.tree.map(lambda leaf: leaf[at], (steps.next_observation, memories))
+            return learner.norm.denormalise(jax.vmap(lambda *end: critic(*end)[0])(seen, before))
+
+        return next_values(value, steps.truncated, p.env.max_cycles, anew)
+
+    next_value = jax.vmap(after, (1, 0, 1), 1)(steps, memory.critic, value)
+    reward = share_reward(steps.reward, steps.observation.agent_mask, p.config.reward == "team")
+    ends = (steps.terminated[..., None], steps.truncated[..., None])
+    terminated, truncated = (jnp.broadcast_to(end, reward.shape) for end in ends)
+    if steps.left is not None:
+        terminated |= steps.left
+    gamma = learner.hyper.gamma
+    if p.config.n_step:
+        returns = n_step_returns(reward, next_value, terminated, truncated, gamma, p.config.n_step)
+        return returns - value, returns
+    advantage = generalised_advantages(
+        reward, value, next_value, terminated, truncated, gamma, learner.hyper.gae_lambda
+    )
+    return advantage, advantage + value
 
 
 def loss(
@@ -94,19 +295,22 @@ def loss(
     ent_coef: Float[Array, ""],
     huber_delta: float,
     count: Int[Array, ""] | None = None,
+    temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Policy, critic and entropy terms on segments; means over the real agents.
+    """Policy, critic and entropy terms on segments, and the messages' own; means over the real agents.
 
     memory: what actor and critic carried before each segment, [B, …]. count: as in `mean_real`.
     """
 
     def one(observation: Observation, first: Array, key: Array, memory: PpoMemory):
-        acted, _ = unroll(network.actor, observation, first, memory.actor, key)
-        return acted.head, network.critic.unroll(observation, first, memory.critic)[0]
+        acted, _ = unroll(network.actor, observation, first, memory.actor, key, temperature)
+        own = {} if acted.message_loss is None else {"loss_messages": acted.message_loss}
+        return acted.head, network.critic.unroll(observation, first, memory.critic)[0], own
 
-    logits, value = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
+    logits, value, own = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
     log_probs = log_policy(logits, sample.observation.action_mask)
-    log_prob = taken(log_probs, sample.action)
+    shares = None if sample.epsilon is None else sample.epsilon[..., None]  # of all agents of an environment
+    log_prob = taken(mixed(log_probs, shares), sample.action)
     real = sample.observation.agent_mask
     parts = {
         "loss_policy": clipped_surrogate(log_prob, sample.log_prob, sample.advantage, hyper.clip_eps),
@@ -114,169 +318,92 @@ def loss(
         "entropy": entropy(log_probs),
         "ratio_clipped": (jnp.abs(jnp.exp(log_prob - sample.log_prob) - 1) > hyper.clip_eps) * 1.0,
         "kl": sample.log_prob - log_prob,
+        **own,
     }
     parts = {name: mean_real(values, real, count) for name, values in parts.items()}
     total = parts["loss_policy"] + hyper.vf_coef * parts["loss_critic"] - ent_coef * parts["entropy"]
-    return total, parts
+    return total + parts["loss_messages"] if own else total, parts
 
 
-def make(config: PpoConfig, env: Environment, training: TrainingConfig, view: View) -> Algorithm:
-    """PPO for this task's shapes, with the critic's view."""
-    actions = choices(env)
-    adam = clipped_adam(config.max_grad_norm, eps=1e-5)
-    settings = matched(env, config.network, actions.size)
-    per_update = training.num_envs * training.num_steps
-    hyper = Hyper(
-        learning_rate=config.learning_rate,
-        learning_rate_end=config.learning_rate_end,
-        ent_coef=config.ent_coef,
-        ent_coef_end=config.ent_coef_end,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        clip_eps=config.clip_eps,
-        vf_coef=config.vf_coef,
-        planned_updates=max(1.0, training.env_steps / per_update),
+def normalised(advantage: Float[Array, "T E N"], real: Bool[Array, "T E N"]) -> Float[Array, "T E N"]:
+    """In standard deviations of the rollout, around its mean."""
+    centre = mean_real(advantage, real)
+    spread = jnp.sqrt(mean_real(jnp.square(advantage - centre), real))
+    return (advantage - centre) / (spread + 1e-8)
+
+
+def gradients_on(p: Setup, whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
+    """Of these rows' part of the loss; count: the real agents of the whole minibatch."""
+    network, sample, memory, hyper, ent_coef, count, temperature = whole
+    part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
+    remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
+    gradient = jax.grad(loss, has_aux=True)
+    return gradient(network, part, remembered, hyper, ent_coef, p.config.huber_delta, count, temperature)
+
+
+def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+    """Targets, then epochs of gradient steps on shuffled minibatches of a rollout [T, E, …]."""
+    turn_key, shuffle_key = jax.random.split(key)
+    memory = split_memory(rollout.first_memory)._replace(exploration=())
+    steps = chosen(p, rollout.transitions)
+    advantage, returns = targets(p, learner, steps, memory)
+    if p.config.augment:
+        # Advantages, returns and the probability of the choice do not turn; what is remembered cannot.
+        steps = turn_experience(p.env, steps, turn_key)
+        memory = jax.tree.map(jnp.zeros_like, memory)
+    real = steps.observation.agent_mask
+    norm = follow_returns(learner.norm, returns, real) if p.config.value_norm else learner.norm
+    sample = sample_of(steps, normalised(advantage, real), norm.normalise(returns))
+    if not jax.tree.leaves(memory):  # nothing holds the steps together: each is a segment
+        sample = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), sample)
+    hyper, fraction = learner.hyper, learner.updates / learner.hyper.planned_updates
+    learning_rate = progress_between(hyper.learning_rate, hyper.learning_rate_end, fraction)
+    ent_coef = progress_between(hyper.ent_coef, hyper.ent_coef_end, fraction)
+    temperature = level_of(p, learner).temperature
+
+    def gradient_step(loop: tuple[Network, Any], step: tuple[Int[Array, " rows"], Int[Array, ""]]):
+        (network, optimizer), (rows, count) = loop, step
+        whole = (network, sample, memory, hyper, ent_coef, count, temperature)
+        gradients, metrics = sum_over_devices(partial(gradients_on, p), whole, rows)
+        directions, optimizer = p.adam.update(gradients, optimizer)
+        network = jax.tree.map(lambda w, d: w - learning_rate * d, network, directions)
+        return (network, optimizer), metrics
+
+    rows = minibatches(shuffle_key, sample.first.shape[1], p.config.update_epochs, p.config.num_minibatches)
+    counts = jax.vmap(lambda rows: sample.observation.agent_mask[:, rows].sum())(rows)
+    start = learner.network, learner.optimizer
+    (network, optimizer), metrics = jax.lax.scan(gradient_step, start, (rows, counts))
+    metrics = {name: values.mean() for name, values in metrics.items()}
+    metrics |= {"learning_rate": learning_rate, "value_error": mean_real(jnp.abs(advantage), real)}
+    exploration = p.explorer.follow(learner.exploration, steps)
+    learner = LearnerState(network, optimizer, norm, learner.updates + 1, hyper, exploration)
+    return learner, metrics
+
+
+def chosen(p: Setup, steps: Transition) -> Transition:
+    """The steps with choices for actions, and with the masks of choices."""
+    available = p.actions.mask(steps.observation.action_mask)
+    return steps._replace(
+        observation=steps.observation._replace(action_mask=available),
+        decision=steps.decision._replace(action=steps.decision.extras["choice"]),
     )
 
-    def networks(key: PRNGKey) -> Network:
-        actor_key, critic_key = jax.random.split(key)
-        gain = 2**0.5
-        return Network(
-            AgentNetwork(env, settings, actions.size, actor_key, gain, head_gain=0.01),
-            Critic(env, settings, view, critic_key, gain),
-        )
 
-    def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
-        network = networks(key)
-        return LearnerState(
-            network=network,
-            optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            norm=no_returns(),
-            updates=jnp.zeros((), jnp.int32),
-            hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
-        )
-
-    def initial_memory(num_agents: int) -> Memory:
-        network = eqx.filter_eval_shape(networks, jax.random.key(0))
-        memory = PpoMemory(network.actor.initial_memory(num_agents), network.critic.initial_memory(num_agents))
-        return memory if jax.tree.leaves(memory) else ()
-
-    def policy(learner: LearnerState, explore: bool) -> Policy:
-        def act(
-            memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
-        ) -> tuple[Decision, Memory]:
-            actor_memory, critic_memory = split_memory(memory)
-            talk_key, choice_key = jax.random.split(key)
-            actor = learner.network.actor
-            if explore:
-                output, actor_memory = actor(observation, actor_memory, talk_key, channel)
-            else:
-                output, actor_memory = play(env, config.symmetric_play, actor, observation, actor_memory, channel)
-            log_probs = log_policy(output.head, actions.mask(observation.action_mask))
-            choice = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
-            value, critic_memory = learner.network.critic(observation, critic_memory)
-            extras = {
-                "value": learner.norm.denormalise(value),
-                "choice": choice,
-                "log_prob": taken(log_probs, choice),
-                "key": talk_key,
-            }
-            decision = Decision(actions.act(choice), output.message, output.adjacency, extras)
-            return decision, PpoMemory(actor_memory, critic_memory) if memory else ()
-
-        return act
-
-    def targets(
-        learner: LearnerState, steps: Transition, memory: PpoMemory
-    ) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
-        """Advantages and returns of every agent, in the units of the reward."""
-        critic, value = learner.network.critic, steps.decision.extras["value"]
-
-        def after(steps: Transition, memory: Memory, value: Float[Array, "T N"]) -> Float[Array, "T N"]:
-            memories = () if critic.memory is None else critic.unroll(steps.observation, steps.first, memory)[1]
-
-            def anew(at: Int[Array, " K"]) -> Float[Array, "K N"]:
-                seen, before = jax.tree.map(lambda leaf: leaf[at], (steps.next_observation, memories))
-                return learner.norm.denormalise(jax.vmap(lambda *end: critic(*end)[0])(seen, before))
-
-            return next_values(value, steps.truncated, env.max_cycles, anew)
-
-        next_value = jax.vmap(after, (1, 0, 1), 1)(steps, memory.critic, value)
-        reward = share_reward(steps.reward, steps.observation.agent_mask, config.reward == "team")
-        ends = (steps.terminated[..., None], steps.truncated[..., None])
-        terminated, truncated = (jnp.broadcast_to(end, reward.shape) for end in ends)
-        gamma = learner.hyper.gamma
-        if config.n_step:
-            returns = n_step_returns(reward, next_value, terminated, truncated, gamma, config.n_step)
-            return returns - value, returns
-        advantage = generalised_advantages(
-            reward, value, next_value, terminated, truncated, gamma, learner.hyper.gae_lambda
-        )
-        return advantage, advantage + value
-
-    def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
-        turn_key, shuffle_key = jax.random.split(key)
-        memory = split_memory(rollout.first_memory)
-        steps = rollout.transitions
-        steps = steps._replace(
-            observation=steps.observation._replace(action_mask=actions.mask(steps.observation.action_mask)),
-            decision=steps.decision._replace(action=steps.decision.extras["choice"]),
-        )
-        advantage, returns = targets(learner, steps, memory)
-        if config.augment:
-            # Advantages, returns and the probability of the choice do not turn; what is remembered cannot.
-            steps = turn_experience(env, steps, turn_key)
-            memory = jax.tree.map(jnp.zeros_like, memory)
-        real = steps.observation.agent_mask
-        norm = follow_returns(learner.norm, returns, real) if config.value_norm else learner.norm
-        centre = mean_real(advantage, real)
-        spread = jnp.sqrt(mean_real(jnp.square(advantage - centre), real))
-        sample = Sample(
-            observation=steps.observation,
-            first=steps.first,
-            action=steps.decision.action,  # pyright: ignore[reportArgumentType] they are indices now
-            key=steps.decision.extras["key"],
-            log_prob=steps.decision.extras["log_prob"],
-            advantage=(advantage - centre) / (spread + 1e-8),
-            target=norm.normalise(returns),
-        )
-        if not jax.tree.leaves(memory):  # nothing holds the steps together: each is a segment
-            sample = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), sample)
-        hyper, fraction = learner.hyper, learner.updates / learner.hyper.planned_updates
-        learning_rate = progress_between(hyper.learning_rate, hyper.learning_rate_end, fraction)
-        ent_coef = progress_between(hyper.ent_coef, hyper.ent_coef_end, fraction)
-
-        def gradients_on(whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
-            """Of these rows' part of the loss; count: the real agents of the whole minibatch."""
-            network, sample, memory, hyper, ent_coef, count = whole
-            part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
-            remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
-            gradient = jax.grad(loss, has_aux=True)
-            return gradient(network, part, remembered, hyper, ent_coef, config.huber_delta, count)
-
-        def gradient_step(loop: tuple[Network, Any], step: tuple[Int[Array, " rows"], Int[Array, ""]]):
-            (network, optimizer), (rows, count) = loop, step
-            whole = (network, sample, memory, hyper, ent_coef, count)
-            gradients, metrics = sum_over_devices(gradients_on, whole, rows)
-            directions, optimizer = adam.update(gradients, optimizer)
-            network = jax.tree.map(lambda w, d: w - learning_rate * d, network, directions)
-            return (network, optimizer), metrics
-
-        rows = minibatches(shuffle_key, sample.first.shape[1], config.update_epochs, config.num_minibatches)
-        counts = jax.vmap(lambda rows: sample.observation.agent_mask[:, rows].sum())(rows)
-        (network, optimizer), metrics = jax.lax.scan(
-            gradient_step, (learner.network, learner.optimizer), (rows, counts)
-        )
-        metrics = {name: values.mean() for name, values in metrics.items()}
-        metrics |= {"learning_rate": learning_rate, "value_error": mean_real(jnp.abs(advantage), real)}
-        return LearnerState(network, optimizer, norm, learner.updates + 1, hyper), metrics
-
-    return Algorithm(init, initial_memory, policy, update, hyper)
-
-
-def split_memory(memory: Memory) -> PpoMemory:
-    """A policy's memory as actor's and critic's."""
-    return memory if isinstance(memory, PpoMemory) else PpoMemory((), ())
+def sample_of(steps: Transition, advantage: Float[Array, "T E N"], target: Float[Array, "T E N"]) -> Sample:
+    """What is learned from: a rollout's choices, and what came of them."""
+    extras, first = steps.decision.extras, steps.first
+    if steps.left is not None:
+        first = jax.vmap(beginnings, 1, 1)(steps.first, steps.left)
+    return Sample(
+        observation=steps.observation,
+        first=first,
+        action=steps.decision.action,  # pyright: ignore[reportArgumentType] they are indices now
+        key=extras["key"],
+        log_prob=extras["log_prob"],
+        advantage=advantage,
+        target=target,
+        epsilon=extras.get("epsilon"),
+    )
 
 
 def minibatches(key: PRNGKey, size: int, epochs: int, count: int) -> Int[Array, "steps rows"]:

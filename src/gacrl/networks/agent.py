@@ -16,11 +16,12 @@ from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks import communication
 from gacrl.networks import torso as torsos
-from gacrl.networks.communication import Communication, Neighbourhood
+from gacrl.networks.communication.base import Communication, Neighbourhood
 from gacrl.networks.encoder import Code
 from gacrl.networks.graph import audible, observed_adjacency
 from gacrl.networks.gru import Gru
 from gacrl.networks.layers import Linear, num_parameters
+from gacrl.networks.memory import restarted
 from gacrl.types import Channel, Memory, Observation, PRNGKey
 
 
@@ -40,6 +41,8 @@ class AgentOutput(NamedTuple):
     """Of the symbols sent, nats; 0 without symbols."""
     code_loss: Float[Array, " N"] | float
     """Negative evidence lower bound of the code, up to constants; 0 without a code."""
+    message_loss: Float[Array, " N"] | None = None
+    """The loss of the kind of message, where it has one."""
 
 
 class Seen(NamedTuple):
@@ -129,7 +132,8 @@ class AgentNetwork(eqx.Module):
         if message is not None:
             message = jnp.where(observation.agent_mask[:, None], message, 0.0)
         head = self.head(spoken.hidden)
-        return AgentOutput(head, spoken.hidden, message, adjacency, spoken.entropy, seen.code_loss), spoken.inbox
+        output = AgentOutput(head, spoken.hidden, message, adjacency, spoken.entropy, seen.code_loss, spoken.loss)
+        return output, spoken.inbox
 
     def _around(
         self, observation: Observation, channel: Channel | None
@@ -142,14 +146,15 @@ class AgentNetwork(eqx.Module):
 def unroll(
     network: AgentNetwork,
     observations: Observation,
-    first: Bool[Array, " T"],
+    first: Bool[Array, "T ..."],
     memory: Memory,
     keys: Key[Array, " T"] | None,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[AgentOutput, Memory]:
     """The network over T steps of one environment: outputs, and the memory *after* each step, [T, …].
 
-    The memory starts anew where `first`. What does not wait for the step before is computed for all steps at once.
+    The memory starts anew where `first` [T], or [T, N] for each agent. What does not wait for the step before is
+    computed for all steps at once.
     """
     if not isinstance(memory, AgentMemory):
         return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
@@ -161,9 +166,9 @@ def unroll(
         return output, AgentMemory(carries, memory.inbox)
     fresh = network.initial_memory(observations.features.shape[-2])
 
-    def step(memory: Memory, inputs: tuple[Observation, Bool[Array, ""], Any]):
+    def step(memory: Memory, inputs: tuple[Observation, Bool[Array, "..."], Any]):
         seen, first, key = inputs
-        memory = jax.tree.map(lambda new, old: jnp.where(first, new, old), fresh, memory)
+        memory = restarted(fresh, memory, first)
         output, memory = network(seen, memory, key, None, temperature)
         return memory, (output, memory)
 

@@ -47,7 +47,9 @@ class Critic(eqx.Module):
         torso_key, world_key, merge_key, memory_key, head_key = jax.random.split(key, 5)
         width, central = config.width, view == "central"
         self.torso = torsos.make(env, config, torso_key, gain)
-        state_size = jax.eval_shape(lambda: global_state(env.reset(jax.random.key(0))[1])).size
+        state_size = jax.eval_shape(
+            lambda: global_state(env.reset(jax.random.key(0), env.default_params())[1])
+        ).size
         by_vector = central and config.torso == "mlp"
         self.world = Mlp(state_size, (width,), world_key, gain) if by_vector else None
         self.merge = Linear(2 * width, width, merge_key, gain) if central else None
@@ -64,9 +66,10 @@ class Critic(eqx.Module):
         return self.head(hidden)[:, 0], memory
 
     def unroll(
-        self, observations: Observation, first: Bool[Array, " T"], memory: Memory
+        self, observations: Observation, first: Bool[Array, "T ..."], memory: Memory
     ) -> tuple[Float[Array, "T N"], Memory]:
-        """Values along T steps of one environment, and the memory after each step; it starts anew where `first`."""
+        """Values along T steps of one environment, and the memory after each step; it starts anew where `first` [T], or
+        [T, N] for each agent."""
         hidden = jax.vmap(self._see)(observations)
         if self.memory is not None:
             memory = hidden = self.memory.unroll(hidden, first, memory)

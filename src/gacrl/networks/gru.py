@@ -37,16 +37,17 @@ class Gru(eqx.Module):
         return self._advance(self._gates(x), memory)
 
     def unroll(
-        self, x: Float[Array, "T N H"], first: Bool[Array, " T"], memory: Float[Array, "N H"]
+        self, x: Float[Array, "T N H"], first: Bool[Array, "T ..."], memory: Float[Array, "N H"]
     ) -> Float[Array, "T N H"]:
-        """The memory after each step; before one that is `first` it is empty.
+        """The memory after each step; before one that is `first` [T], or [T, N] for each agent, it is empty.
 
         The inputs' products, which wait for nothing, are computed for all steps at once.
         """
 
         def step(memory: Array, inputs: tuple[Gates, Array]) -> tuple[Array, Array]:
             gates, first = inputs
-            memory = self._advance(gates, jnp.where(first, 0.0, memory))
+            begins = first if first.ndim == 0 else first[:, None]
+            memory = self._advance(gates, jnp.where(begins, 0.0, memory))
             return memory, memory
 
         return jax.lax.scan(step, memory, (self._gates(x), first))[1]

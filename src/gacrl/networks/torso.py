@@ -5,7 +5,7 @@ Both are computed by each agent from its own observation; what other agents know
 """
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from gacrl.config.algorithms import NetworkConfig
-from gacrl.envs.environment import Environment, SpatialEnvironment
+from gacrl.envs.environment import Environment
 from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Mlp, Score
 from gacrl.types import Entities, Observation, PRNGKey
@@ -57,35 +57,48 @@ class GraphTorso(eqx.Module):
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         rival_key, landmark_key, agent_key, attention_key, out_key = jax.random.split(key, 5)
         width, narrow = config.width, config.width // 2
-        own = env.own_size if isinstance(env, SpatialEnvironment) else env.observation_size
-        self.rival = Mlp(2 * SCALES, (narrow,), rival_key, gain)
-        self.landmark = Mlp(own + SCALES + narrow, (width, width), landmark_key, gain)
-        self.agent = Mlp(own + SCALES, (narrow,), agent_key, gain)
+        seen = jax.eval_shape(lambda: env.entities(env.reset(jax.random.key(0), env.default_params())[1]))
+        own = seen.own.shape[-1]
+        known, told = (0 if it is None else it.shape[-1] for it in (seen.landmark_features, seen.agent_features))
+        self.rival = Mlp(2 * SCALES + known + told, (narrow,), rival_key, gain)
+        self.landmark = Mlp(own + SCALES + known + narrow, (width, width), landmark_key, gain)
+        self.agent = Mlp(own + SCALES + told, (narrow,), agent_key, gain)
         self.attention = Score(width, attention_key, gain)
         self.out = Mlp(own + 2 * width + narrow, (width,), out_key, gain)
-        self.view = env.entities if isinstance(env, SpatialEnvironment) else _nothing_in_sight
+        self.view = env.entities
         self.nearest_landmarks, self.nearest_agents = config.nearest_landmarks, config.nearest_agents
 
     def __call__(self, observation: Observation) -> Float[Array, "N H"]:
         seen = self.view(observation)
         own = seen.own
-        landmarks, landmark_there = _nearest(seen.landmarks, self.nearest_landmarks)  # [N L 2]
-        agents, agent_there = _nearest(seen.agents, self.nearest_agents)  # [N M 2]
+        landmarks = _nearest(seen.landmarks, seen.landmark_mask, seen.landmark_features, self.nearest_landmarks)
+        agents = _nearest(seen.agents, seen.agent_mask, seen.agent_features, self.nearest_agents)
 
         # Agent → landmark, in the agent's own frame: where each rival stands from each landmark, and where I do.
-        between = _scales(agents[:, None, :, :] - landmarks[:, :, None, :])  # [N L M 5]
-        mine = jnp.broadcast_to(_scales(-landmarks)[:, :, None, :], between.shape)
-        rivals = self.rival(jnp.concatenate([between, mine], axis=-1))  # [N L M H/2]
-        contest = _pool_max(rivals, agent_there[:, None, :], axis=2)
+        between = _scales(agents.offsets[:, None, :, :] - landmarks.offsets[:, :, None, :])  # [N L M 5]
+        mine = jnp.broadcast_to(_scales(-landmarks.offsets)[:, :, None, :], between.shape)
+        told = _features(landmarks, between, axis=2) + _features(agents, between, axis=1)
+        rivals = self.rival(jnp.concatenate([between, mine, *told], axis=-1))  # [N L M H/2]
+        contest = _pool_max(rivals, agents.there[:, None, :], axis=2)
 
         # Landmark → agent, and agent → agent.
-        places = self.landmark(jnp.concatenate([_repeat(own, landmarks), _scales(landmarks), contest], axis=-1))
-        score = jnp.where(landmark_there, self.attention(places), -jnp.inf)
+        places = [_repeat(own, landmarks.offsets), _scales(landmarks.offsets), *_features(landmarks), contest]
+        places = self.landmark(jnp.concatenate(places, axis=-1))
+        score = jnp.where(landmarks.there, self.attention(places), -jnp.inf)
         chosen = attend(places, score)
-        best = _pool_max(places, landmark_there, axis=1)
-        others = self.agent(jnp.concatenate([_repeat(own, agents), _scales(agents)], axis=-1))
-        crowd = _pool_max(others, agent_there, axis=1)
+        best = _pool_max(places, landmarks.there, axis=1)
+        others = [_repeat(own, agents.offsets), _scales(agents.offsets), *_features(agents)]
+        others = self.agent(jnp.concatenate(others, axis=-1))
+        crowd = _pool_max(others, agents.there, axis=1)
         return self.out(jnp.concatenate([own, chosen, best, crowd], axis=-1))
+
+
+class _Group(NamedTuple):
+    """The entities of one kind that an agent looks at."""
+
+    offsets: Float[Array, "N M 2"]
+    there: Bool[Array, "N M"]
+    features: Float[Array, "N M F"] | None
 
 
 Torso: TypeAlias = MlpTorso | GraphTorso
@@ -96,22 +109,33 @@ def make(env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | No
     return (GraphTorso if config.torso == "graph" else MlpTorso)(env, config, key, gain)
 
 
-def _nothing_in_sight(observation: Observation) -> Entities:
-    """For tasks without space: an agent, alone with its features."""
-    nothing = jnp.zeros((observation.features.shape[0], 0, 2))
-    return Entities(own=observation.features, landmarks=nothing, agents=nothing)
-
-
 def _nearest(
-    offsets: Float[Array, "N M 2"], count: int | None
-) -> tuple[Float[Array, "N K 2"], Bool[Array, "N K"]]:
-    """The nearest entities (all of them for None), and which are there: one at distance 0 is padding."""
+    offsets: Float[Array, "N M 2"],
+    there: Bool[Array, "N M"],
+    features: Float[Array, "N M F"] | None,
+    count: int | None,
+) -> _Group:
+    """The nearest of the entities that are there; all of them for None."""
+    if count is None or count >= offsets.shape[1]:
+        return _Group(offsets, there, features)
     squared = jnp.square(offsets).sum(-1)
-    if count is not None and count < offsets.shape[1]:
-        near = jax.lax.top_k(-jnp.where(squared > 0, squared, jnp.inf), count)[1]
-        offsets = jnp.take_along_axis(offsets, near[..., None], axis=1)
-        squared = jnp.take_along_axis(squared, near, axis=1)
-    return offsets, squared > 0
+    near = jax.lax.top_k(-jnp.where(there, squared, jnp.inf), count)[1]
+
+    def chosen(values: Float[Array, "N M F"]) -> Float[Array, "N K F"]:
+        return jnp.take_along_axis(values, near[..., None], axis=1)
+
+    there = jnp.take_along_axis(there, near, axis=1)
+    return _Group(chosen(offsets), there, None if features is None else chosen(features))
+
+
+def _features(group: _Group, like: Float[Array, "N L M S"] | None = None, axis: int = 0) -> list[Array]:
+    """The features of a group, none or one array; `like`: repeated along an axis, for each pair."""
+    if group.features is None:
+        return []
+    if like is None:
+        return [group.features]
+    values = jnp.expand_dims(group.features, axis)
+    return [jnp.broadcast_to(values, (*like.shape[:3], values.shape[-1]))]
 
 
 def _scales(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 5"]:

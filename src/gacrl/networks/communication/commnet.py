@@ -1,0 +1,39 @@
+"""CommNet: agents average each other's hidden states."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gacrl.config.algorithms import NetworkConfig
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, neighbour_mean, received
+from gacrl.networks.layers import Linear
+from gacrl.types import Channel, PRNGKey
+
+
+class CommNet(Communication):
+    """h ← tanh(H h + C mean of the neighbours' h), for some rounds (Sukhbaatar et al. 2016, eq. 2 and 3)."""
+
+    own: tuple[Linear, ...]
+    heard: tuple[Linear, ...]
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+        own_key, heard_key = jax.random.split(key)
+        width, rounds = config.width, config.rounds
+        self.own = tuple(Linear(width, width, k, gain) for k in jax.random.split(own_key, rounds))
+        self.heard = tuple(Linear(width, width, k, gain) for k in jax.random.split(heard_key, rounds))
+
+    def speak(
+        self,
+        hidden: Float[Array, "N H"],
+        near: Neighbourhood,
+        channel: Channel,
+        key: PRNGKey | None,
+        temperature: Float[Array, ""] | float,
+        code: Float[Array, "N Z"] | None = None,
+    ) -> Spoken:
+        message = hidden
+        for own, heard in zip(self.own, self.heard, strict=True):
+            message = hidden
+            told = received(message, channel, key)
+            hidden = jnp.tanh(own(hidden) + heard(neighbour_mean(told, near.adjacency)))
+        return Spoken(hidden, message)
