@@ -12,11 +12,11 @@ import numpy as np
 from gacrl import tasks
 from gacrl.adapters import mpe2
 from gacrl.config import presets
-from gacrl.config.algorithms import AlgorithmConfig, GacrlPaperConfig, PpoConfig, QmixConfig
-from gacrl.config.run import EnvConfig
+from gacrl.config.algorithms import AlgorithmConfig, GacrlConfig, GacrlPaperConfig, PpoConfig
 from gacrl.envs.probes import BEST_RETURN
+from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.tasks.spread import scripted
+from gacrl.networks.communication import hears_late
 from gacrl.training.probing import probe_algorithm
 from gacrl.versions import versions
 
@@ -66,8 +66,9 @@ def examine() -> Iterator[Finding]:
 
 def _same_world() -> Finding:
     """The oracle's return in our environment and in the real MPE2, on each one's own starts."""
-    env = tasks.make(EnvConfig())
-    policy, memory = scripted.make("oracle", env)
+    task = tasks.find(tasks.DEFAULT)
+    env = task.make(tasks.default_settings(tasks.DEFAULT))
+    policy, memory = references.actor(task, "oracle", env)
     key, episodes = stream_key("monitor"), 64
     ours = jax.jit(lambda: evaluate(env, policy, memory, env.default_params(), key, episodes))()
     theirs = mpe2.evaluate(env, policy, memory, key, episodes)
@@ -91,7 +92,7 @@ def trial(algorithm: AlgorithmConfig) -> Trial:
     if isinstance(algorithm, PpoConfig):
         return Trial(replace(algorithm, network=network), 40, 128)
     algorithm = replace(algorithm, network=network, learning_starts=0, updates=8)
-    if isinstance(algorithm, QmixConfig):
+    if not isinstance(algorithm, GacrlConfig):
         window = min(algorithm.sequence_length, 2)
         return Trial(replace(algorithm, sequence_length=window, batch_size=32, learning_rate=5e-3), 60, 64)
     return Trial(replace(algorithm, network=network, batch_size=128, learning_rate=2e-3), 150, 64)
@@ -100,10 +101,10 @@ def trial(algorithm: AlgorithmConfig) -> Trial:
 def _learns(preset: str, asked: Trial) -> Iterator[Finding]:
     """The probes in which acting matters, one finding each; those beyond an algorithm are only reported.
 
-    What DIAL's agents say is heard a step later: their probe of messages is the late one.
+    For agents that hear a step later what is said, the late probe of messages is theirs.
     """
     network = getattr(asked.algorithm, "network", None)
-    late = network is not None and network.communication == "dial"
+    late = network is not None and hears_late(network)
     probes = ("action", "both", "late_message" if late else "message")
     result = probe_algorithm(*asked, probes=probes)
     for probe in probes:

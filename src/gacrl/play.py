@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,17 @@ from jaxtyping import Array, Float
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.config.algorithms import AlgorithmConfig, GacrlPaperConfig, QLearningConfig
 from gacrl.config.checks import unknown
-from gacrl.config.run import CurriculumConfig, EnvConfig, RunConfig
+from gacrl.config.run import RunConfig
+from gacrl.envs.environment import Environment
 from gacrl.errors import UserError
-from gacrl.tasks.spread import scripted
-from gacrl.tasks.spread.environment import Spread
-from gacrl.training import build, checkpoint, keeper, session
+from gacrl.evaluation.references import FLOORS, noop, playable, random
+from gacrl.tasks.task import Task
+from gacrl.training import build, checkpoint, session
 from gacrl.training.devices import one_seed, rows
+from gacrl.training.keeper import Acting
 from gacrl.training.recorder import RunFolder
+from gacrl.training.session import Parent
 from gacrl.training.trainer import Trainer
 from gacrl.types import Channel, Memory, Policy
 
@@ -32,16 +34,21 @@ class TrainedRun:
 
     name: str
     config: RunConfig
-    """As trained, but for the changes of the task that were asked for."""
+    """As trained, except for the changes of the task that were asked for."""
     trainer: Trainer
     learners: Any
-    """Stacked over the seeds."""
+    """What acts, stacked over the seeds."""
     env_steps: int
 
     @property
-    def env(self) -> Spread:
-        """The task to be played."""
-        return tasks.make(self.config.env)
+    def task(self) -> Task:
+        """The task that is played."""
+        return tasks.find(self.config.task)
+
+    @property
+    def env(self) -> Environment:
+        """The environment that is played in."""
+        return self.trainer.evaluation_env
 
     def policy(self, member: int, explore: bool) -> Policy:
         """The policy of one seed."""
@@ -50,56 +57,63 @@ class TrainedRun:
 
 def open_run(
     run: str | Path,
-    change: Callable[[EnvConfig], EnvConfig] = lambda env: env,
+    change: Callable[[Any], Any] = lambda settings: settings,
     warn: Callable[[str], None] = lambda sentence: None,
 ) -> TrainedRun:
     """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
 
     `@best` behind it takes the parameters that scored best while training, instead of the newest.
 
-    change: what to alter about the task. Raises UserError for a folder that holds no run, or parameters that
-    do not fit the task.
+    change: what to alter about the task's settings. Raises UserError for a folder that holds no run, a task that is
+    not at hand, or parameters that do not fit the task.
     """
     path, member, kind = _split(str(run))
     folder = RunFolder.open(path)
     config = folder.config()
-    changed = replace(
-        config,
-        env=change(config.env),
-        curriculum=CurriculumConfig(),
-        evaluation=replace(config.evaluation, horizon=None),
-        algorithm=_without_experience(config.algorithm),
-    )
-    if config.algorithm.name == GacrlPaperConfig.name and changed.env.num_agents != config.env.num_agents:
-        raise UserError(
-            f"{path} was trained with {config.env.num_agents} agents, and the paper's GACRL is built for their "
-            "number (equation (10) puts all messages side by side): leave --num-agents out"
-        )
-    trainer = build.make_trainer(changed)
+    folder.warn_of_changed_task(warn)
+    evaluation = replace(config.evaluation, horizon=None)
+    changed = replace(config, env=change(config.env), evaluation=evaluation)
+    _require_playable(path, config, changed)
+    trainer = build.make_trainer(changed, learns=False)
     found, warnings = checkpoint.newest(folder.checkpoints, kind)
     for warning in warnings:
         warn(warning)
     learners = session.load_learners(found, trainer)
     if member is not None:
-        if member >= config.num_seeds:
-            raise UserError(f"{path} has the members 0 to {config.num_seeds - 1}: there is no @{member}")
+        _require_member(path, member, config.num_seeds)
         changed = replace(changed, seed=config.seed + member, num_seeds=1)
-        trainer = build.make_trainer(changed)
+        trainer = build.make_trainer(changed, learns=False)
         learners = rows(learners, member, member + 1)
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
 
-class _Acting(NamedTuple):
-    """The part of a training state that acts, where a checkpoint of the whole has it."""
+def _require_playable(path: Path, trained: RunConfig, asked: RunConfig) -> None:
+    before, now = (tasks.find(config.task).make(config.env).num_agents for config in (trained, asked))
+    if getattr(trained.algorithm, "fixed_team", False) and before != now:
+        raise UserError(
+            f"{path} was trained with {before} agents, and the paper's GACRL is built for their number (equation (10) "
+            "puts all messages side by side): leave --num-agents out"
+        )
 
-    learner: Any
+
+def _require_member(path: Path, member: int, num_seeds: int) -> None:
+    if member >= num_seeds:
+        raise UserError(f"{path} has the members 0 to {num_seeds - 1}: there is no @{member}")
 
 
-def _without_experience(algorithm: AlgorithmConfig) -> AlgorithmConfig:
-    """The same, with no room for a replay: playing needs none, and it is most of a learner."""
-    if isinstance(algorithm, GacrlPaperConfig | QLearningConfig):
-        return replace(algorithm, replay_capacity=1)
-    return algorithm
+def parent(run: str | Path, warn: Callable[[str], None] = lambda sentence: None) -> Parent:
+    """A run to start another training from, by the names that `open_run` takes.
+
+    Raises UserError where there is none.
+    """
+    path, member, kind = _split(str(run))
+    config = RunFolder.open(path).config()
+    found, warnings = checkpoint.newest(RunFolder.open(path).checkpoints, kind)
+    for warning in warnings:
+        warn(warning)
+    if member is not None:
+        _require_member(path, member, config.num_seeds)
+    return Parent(str(run), found, config.num_seeds, member)
 
 
 def pretrained() -> dict[str, Path]:
@@ -121,9 +135,9 @@ def save_policy(run: str | Path, out: Path) -> Path:
     config = replace(RunFolder.open(path).config(), seed=opened.config.seed, num_seeds=1)
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
-    state, fingerprint = _Acting(opened.learners), configuration.fingerprint(config)
-    named = {name: array for name, array in checkpoint.arrays(state).items() if keeper.acts(name)}
-    checkpoint.save(out / "checkpoints", checkpoint.serialise(named), opened.env_steps, fingerprint, {})
+    tensors = checkpoint.serialise(checkpoint.arrays(Acting(opened.learners)))
+    fingerprint = configuration.fingerprint(config)
+    checkpoint.save(out / "checkpoints", tensors, opened.env_steps, fingerprint, {})
     return out
 
 
@@ -151,7 +165,7 @@ class LoadedPolicy:
     >>> actions = policy(observations)  # [N, O] -> [N]
     """
 
-    def __init__(self, env: Spread, policies: dict[bool, Policy], initial_memory: Memory):
+    def __init__(self, env: Environment, policies: dict[bool, Policy], initial_memory: Memory):
         """policies: the greedy one under True, the sampling one under False."""
         self.env = env
         self._initial_memory = initial_memory
@@ -181,15 +195,15 @@ class LoadedPolicy:
 def load_policy(run: str | Path) -> LoadedPolicy:
     """The policy of a run: its folder, `FOLDER@k`, or `random` and `noop`.
 
-    Raises UserError where there is no such run. The oracle and the local policy need the exact state, which
-    observations alone do not give: play them with `gacrl.tasks.spread.scripted`.
+    Raises UserError where there is no such run. Other scripted policies need the exact state, which observations
+    alone do not give.
     """
-    if str(run) in scripted.PLAYABLE:
-        if str(run) not in ("random", "noop"):
-            raise UserError(f"{run} needs the exact state, not observations: use gacrl.tasks.spread.scripted")
-        env = tasks.make(EnvConfig())
-        actor = scripted.make(str(run), env)
+    if str(run) in FLOORS:
+        env = tasks.find(tasks.DEFAULT).make(tasks.default_settings(tasks.DEFAULT))
+        actor = {"random": random, "noop": noop}[str(run)](env)
         return LoadedPolicy(env, dict.fromkeys((True, False), actor.policy), actor.initial_memory)
+    if str(run) in playable(tasks.find(tasks.DEFAULT)):
+        raise UserError(f"{run} needs the exact state, not observations: play it with `gacrl evaluate {run}`")
     opened = open_run(run)
     policies = {greedy: opened.policy(0, not greedy) for greedy in (True, False)}
     return LoadedPolicy(opened.env, policies, opened.trainer.memory)

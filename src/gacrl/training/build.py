@@ -1,16 +1,20 @@
 """What a run is made of, from its settings: the task, the algorithm, the trainer, and what it will take."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 from jax.sharding import Mesh
 
 from gacrl import tasks
 from gacrl.algorithms import build as build_algorithm
-from gacrl.config.algorithms import GacrlConfig, LearningConfig, PpoConfig
+from gacrl.algorithms.contract import Algorithm
+from gacrl.config.checks import require
 from gacrl.config.run import RunConfig
-from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.task import Task
 from gacrl.training import curriculum, footprint
+from gacrl.training.curriculum import constant
 from gacrl.training.devices import mesh_for
 from gacrl.training.trainer import Trainer, TrainState
 
@@ -26,55 +30,90 @@ class Plan:
     bytes_needed: int
     """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it."""
     devices: tuple[str, ...]
+    num_agents: int
+    max_cycles: int
+    """Steps of an episode."""
+    notes: tuple[str, ...]
+    """What is otherwise than the settings make one expect."""
 
 
-def make_trainer(config: RunConfig, devices: Mesh | None = None) -> Trainer:
-    """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`."""
-    env = tasks.make(config.env)
-    if config.env.reward == "potential" and isinstance(config.algorithm, LearningConfig):
-        env = replace(env, initial_params=env.initial_params._replace(potential_discount=config.algorithm.gamma))
-    if config.curriculum.num_agents_start is not None:
-        env = env.padded()
+def make_trainer(config: RunConfig, devices: Mesh | None = None, learns: bool = True) -> Trainer:
+    """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`.
+
+    learns: False for policies that are only played: the task then does not move. Raises ConfigError for settings that
+    do not fit each other.
+    """
+    task = tasks.find(config.task)
+    env, algorithm = task.make(config.env), make_algorithm(config)
+    params = task.numbers(config.env, env, getattr(config.algorithm, "gamma", 1.0))
+    evaluated = evaluated_settings(config)
+    evaluation_env = task.make(evaluated)
     return Trainer(
-        algorithm=build_algorithm.make(config.algorithm, env, config.training),
+        algorithm=algorithm,
         env=env,
-        curriculum=curriculum.make(config.curriculum),
+        params=params,
+        curriculum=curriculum.make(config.curriculum, task, config.env, params) if learns else constant(),
         num_envs=config.training.num_envs,
         num_steps=config.training.num_steps,
         num_seeds=config.num_seeds,
-        evaluation_env=evaluation_env(config),
-        mesh=mesh(config) if devices is None else devices,
-        # GACRL's program is as quick when it is quickly compiled, others' 3 to 10 % slower (docs/design.md).
-        for_speed=not isinstance(config.algorithm, GacrlConfig),
+        metrics=task.metrics,
+        evaluation_env=evaluation_env,
+        evaluation_params=task.numbers(evaluated, evaluation_env),
+        mesh=mesh(config, algorithm) if devices is None else devices,
+        for_speed=algorithm.compiled_for_speed,
+        watched=tasks.brought(config.task) is not None,
     )
 
 
-def mesh(config: RunConfig) -> Mesh:
-    """The devices that train this configuration: PPO learns from environments that are spread over several."""
-    return mesh_for(
-        config.num_seeds, config.training.num_envs if isinstance(config.algorithm, PpoConfig) else None
+def make_algorithm(config: RunConfig) -> Algorithm:
+    """The algorithm for the shapes of the task. Raises ConfigError for a task that it cannot play."""
+    task = tasks.find(config.task)
+    require(
+        not (getattr(config.algorithm, "fixed_team", False) and task.ragged(config.env)),
+        f"{config.algorithm.name} knows teams of one size only, and in {task.name} as it is set agents may be absent: "
+        "take another preset",
     )
+    return build_algorithm.make(config.algorithm, task.make(config.env), config.training, task.progress)
 
 
-def evaluation_env(config: RunConfig) -> Spread:
+def mesh(config: RunConfig, algorithm: Algorithm | None = None) -> Mesh:
+    """The devices that train this configuration: some algorithms learn from environments spread over several."""
+    algorithm = make_algorithm(config) if algorithm is None else algorithm
+    return mesh_for(config.num_seeds, config.training.num_envs if algorithm.splits_envs else None)
+
+
+def evaluated_settings(config: RunConfig) -> Any:
     """The task as it is evaluated: with the evaluation's own horizon, where it has one."""
-    env, horizon = tasks.make(config.env), config.evaluation.horizon
-    return env if horizon is None else replace(env, max_cycles=horizon)
+    task: Task = tasks.find(config.task)
+    horizon = config.evaluation.horizon
+    return config.env if horizon is None else task.with_horizon(config.env, horizon)
 
 
 def plan(trainer: Trainer, config: RunConfig) -> Plan:
     """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
     member, devices = member_shapes(trainer), list(trainer.mesh.devices.flat)
-    state, working = footprint.size(member), footprint.working_bytes(config, member)
+    state, working = footprint.size(member), footprint.working_bytes(config, trainer.algorithm, member)
     needed = 2 * state * config.num_seeds + working * len(devices)
     footprint.require_room(needed, devices[0])
-    network = getattr(member.learner, "network", ())
+    learned = jax.tree.leaves(trainer.algorithm.parameters(member.learner))
     return Plan(
-        parameters=sum(leaf.size for leaf in jax.tree.leaves(network)),
+        parameters=sum(leaf.size for leaf in learned),
         bytes_per_seed=state,
         bytes_needed=needed,
         devices=tuple(f"{device.platform}:{device.id}" for device in devices),
+        num_agents=trainer.env.num_agents,
+        max_cycles=trainer.env.max_cycles,
+        notes=tuple(_notes(config)),
     )
+
+
+def _notes(config: RunConfig) -> Iterator[str]:
+    task, rule = tasks.find(config.task), getattr(config.algorithm, "exploration", None)
+    if rule == "adaptive" and task.progress is None:
+        yield (
+            f"exploration falls linearly over {config.algorithm.exploration_steps:,} steps: {task.name} does not say "
+            "what progress is"
+        )
 
 
 def member_shapes(trainer: Trainer) -> TrainState:

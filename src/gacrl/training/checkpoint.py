@@ -22,6 +22,7 @@ import safetensors
 import safetensors.numpy
 from jaxtyping import PyTree
 
+from gacrl.algorithms.replay import Replay
 from gacrl.errors import UserError, reason
 
 FORMAT_VERSION = 1
@@ -29,8 +30,8 @@ STEP, BEST = "step-", "best-"
 KEPT = {STEP: 2, BEST: 1}
 """Newest of each kind that stay; of the whole states the one before is there should the newest be damaged."""
 
-RING, ADDED = ".replay.items", ".replay.added"
-"""In the paths of what is remembered, [seeds, rows, …], and of how many rows were ever added, [seeds]."""
+FORMERLY = {".exploration.progress": ".exploration.coverage"}
+"""What an array was called in checkpoints of version 0.1.0."""
 
 _TENSORS, _MANIFEST, _UNFINISHED, _DAMAGED = "state.safetensors", "manifest.json", ".unfinished-", ".damaged-"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, RecursionError, safetensors.SafetensorError)
@@ -47,25 +48,27 @@ class Checkpoint(NamedTuple):
     """What the host loop needs to go on, such as seconds spent so far; of the best policy, its score."""
 
 
-def arrays(state: PyTree) -> dict[str, np.ndarray]:
-    """A state's leaves on the host, by their paths. They may be views: use them before the state is donated."""
+def arrays(state: PyTree, replay: Replay[Any] | None = None) -> dict[str, np.ndarray]:
+    """A state's leaves on the host, by their paths. They may be views: use them before the state is donated.
+
+    replay: the part of it that remembers, stacked over the seeds, [seeds, rows, …]. It is cut to the rows that are
+    filled; the others are zeros, and `load` makes them again.
+    """
+    remembered = _ids(replay)
+    filled = int(np.asarray(replay.added).max()) if replay is not None else 0
 
     def plain(leaf: jax.Array) -> np.ndarray:
         if _is_key(leaf):
             leaf = jax.random.key_data(leaf)
-        return np.asarray(leaf, order="C")
+        array = np.asarray(leaf, order="C")
+        return np.ascontiguousarray(array[:, :filled]) if id(leaf) in remembered else array
 
     return {jax.tree_util.keystr(path): plain(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(state)}
 
 
-def without_empty_rows(named: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The same, what is remembered cut to the filled rows; the others are zeros, and `load` makes them again."""
-
-    def cut(name: str, array: np.ndarray) -> np.ndarray:
-        before, ring, _ = name.partition(RING)
-        return np.ascontiguousarray(array[:, : named[before + ADDED].max()]) if ring else array
-
-    return {name: cut(name, array) for name, array in named.items()}
+def _ids(replay: Replay[Any] | None) -> set[int]:
+    """Of the leaves that remember."""
+    return set() if replay is None else {id(leaf) for leaf in jax.tree.leaves(replay.items)}
 
 
 def serialise(named: Mapping[str, np.ndarray]) -> bytes:
@@ -142,31 +145,30 @@ def set_aside_damaged(folder: Path, kind: str = STEP) -> list[Path]:
     return aside
 
 
-def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, ...] = ()) -> Tree:
+def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", replay: Replay[Any] | None = None) -> Tree:
     """The saved state in the structure of `like` (arrays or their shapes).
 
-    prefix: the path of `like` inside the saved state, such as `.learner`. skip: paths inside `like`, such as
-    `.replay`, that are not looked for and come as zeros. Raises UserError for a checkpoint
-    of another architecture, naming the first array that differs.
+    prefix: the path of `like` inside the saved state, such as `.learner`. replay: the part of `like` that remembers,
+    of which the empty rows were not saved. Raises UserError for a checkpoint of another architecture, naming the first
+    array that differs.
     """
+    remembered = _ids(replay)
     path = checkpoint.folder / _TENSORS
     with safetensors.safe_open(str(path), "np") as file:
         saved = set(file.keys())
         leaves, structure = jax.tree_util.tree_flatten_with_path(like)
         loaded: list[Any] = []
         for key_path, leaf in leaves:
-            inside = jax.tree_util.keystr(key_path)
-            if inside.startswith(skip):
-                loaded.append(jnp.zeros(leaf.shape, leaf.dtype))
-                continue
-            name = prefix + inside
+            name = prefix + jax.tree_util.keystr(key_path)
+            for now, before in FORMERLY.items():
+                name = name if name in saved else name.replace(now, before)
             is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
             found = None
             if name in saved:
                 with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
                     found = file.get_tensor(name)
-            if found is not None and RING in name:
+            if found is not None and id(leaf) in remembered:
                 found = _with_empty_rows(found, wanted.shape)
             if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
@@ -180,7 +182,7 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", skip: tuple[str, 
 
 
 def _with_empty_rows(saved: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """What `without_empty_rows` took away is there again; an array that differs otherwise stays as it is."""
+    """What `arrays` took away is there again; an array that differs otherwise stays as it is."""
     if saved.ndim != len(shape) or saved.shape[1] >= shape[1]:
         return saved
     return np.pad(saved, [(0, shape[1] - saved.shape[1] if axis == 1 else 0) for axis in range(saved.ndim)])

@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from gacrl.config.checks import require
 from gacrl.config.run import CurriculumConfig
 from gacrl.envs.environment import EnvParams
+from gacrl.tasks.task import Task
 from gacrl.types import Rollout
 
 CurriculumState: TypeAlias = Any
@@ -26,8 +29,8 @@ class Stage(NamedTuple):
 
     episode: Int[Array, ""]
     """Finished episodes that count (those of all environments)."""
-    coverage: Float[Array, ""] | None
-    """Running mean of the share of landmarks covered within θ at an episode's end; None without a gate."""
+    progress: Float[Array, ""] | None
+    """Running mean of the task's progress at an episode's end; None without a gate."""
     base: EnvParams
     """The task as configured, before any change."""
 
@@ -41,47 +44,21 @@ def constant() -> Curriculum:
     return Curriculum(lambda params: (params, params), lambda params, env_steps, rollout: (params, params))
 
 
-def linear(config: CurriculumConfig) -> Curriculum:
-    """The task moves in a straight line over the episodes that count, once an episode.
-
-    The paper's: local ratio and θ over all episodes. Agents that join do so at once, where they happen to be: the
-    environments share their parameters.
-    """
+def linear(config: CurriculumConfig, task: Task, settings: Any) -> Curriculum:
+    """The task's difficulty goes from 0 to 1 over the episodes that count, once an episode."""
 
     def params_at(stage: Stage) -> EnvParams:
-        base, progress = stage.base, jnp.minimum(stage.episode / config.episodes, 1.0)
-
-        def between(start: Array | float | None, end: Array | float | None, constant: Array) -> Array:
-            """Where one end is not configured the task's own stands; where neither is, it is constant."""
-            if start is None and end is None:
-                return constant
-            start, end = (constant if bound is None else bound for bound in (start, end))
-            return start + progress * (end - start)
-
-        params = base._replace(
-            local_ratio=between(None, config.local_ratio_end, base.local_ratio),
-            coverage_threshold=between(None, config.coverage_threshold_end, base.coverage_threshold),
-            arena_scale=between(config.arena_scale_start, None, base.arena_scale),
-        )
-        if config.num_agents_start is None:
-            return params
-        num_agents, num_landmarks = base.agent_mask.size, base.landmark_mask.size
-        agents = jnp.floor(config.num_agents_start + progress * (num_agents - config.num_agents_start))
-        landmarks = jnp.ceil(agents * num_landmarks / num_agents)
-        return params._replace(
-            agent_mask=base.agent_mask & (jnp.arange(num_agents) < agents),
-            landmark_mask=base.landmark_mask & (jnp.arange(num_landmarks) < landmarks),
-        )
+        return task.difficulty(settings, stage.base, jnp.minimum(stage.episode / config.episodes, 1.0))
 
     def advance(stage: Stage, env_steps: Int[Array, ""], rollout: Rollout):
         steps = rollout.transitions
         done = steps.terminated | steps.truncated
-        ended, coverage = done.sum(), stage.coverage
-        if config.gate is not None and coverage is not None:
-            covered = jnp.where(done, steps.info["coverage_theta"], 0.0).sum() / jnp.maximum(ended, 1)
-            coverage += (1.0 - (1.0 - _MEMORY) ** ended) * (covered - coverage)
-            ended = jnp.where(coverage >= config.gate, ended, 0)
-        stage = stage._replace(episode=stage.episode + ended, coverage=coverage)
+        ended, progress = done.sum(), stage.progress
+        if config.gate is not None and progress is not None and task.progress is not None:
+            reached = jnp.where(done, steps.info[task.progress], 0.0).sum() / jnp.maximum(ended, 1)
+            progress += (1.0 - (1.0 - _MEMORY) ** ended) * (reached - progress)
+            ended = jnp.where(progress >= config.gate, ended, 0)
+        stage = stage._replace(episode=stage.episode + ended, progress=progress)
         return stage, params_at(stage)
 
     def init(params: EnvParams) -> tuple[Stage, EnvParams]:
@@ -91,6 +68,29 @@ def linear(config: CurriculumConfig) -> Curriculum:
     return Curriculum(init, advance)
 
 
-def make(config: CurriculumConfig) -> Curriculum:
-    """The curriculum that the configuration asks for."""
-    return linear(config) if config.changes else constant()
+def make(config: CurriculumConfig, task: Task, settings: Any, params: EnvParams) -> Curriculum:
+    """The curriculum that settings of the run and of the task ask for.
+
+    Raises ConfigError for a gate where nothing moves, or where the task does not say what progress is.
+    """
+    if not _moves(task, settings, params):
+        require(config.gate is None, f"curriculum.gate has nothing to hold back: {task.name} stays as it is")
+        return constant()
+    require(
+        config.gate is None or task.progress is not None,
+        f"curriculum.gate needs a task that says what progress is, and {task.name} does not: leave it out",
+    )
+    return linear(config, task, settings)
+
+
+def _moves(task: Task, settings: Any, params: EnvParams) -> bool:
+    """Whether the difficulty changes anything: whether it gives back other numbers than it was given."""
+    same: list[bool] = []
+
+    def look(params: EnvParams, share: Float[Array, ""]) -> Bool[Array, ""]:
+        before, after = jax.tree.leaves(params), jax.tree.leaves(task.difficulty(settings, params, share))
+        same.append(len(before) == len(after) and all(a is b for a, b in zip(before, after, strict=True)))
+        return share > 0
+
+    jax.eval_shape(look, params, jax.ShapeDtypeStruct((), jnp.float32))
+    return not same[0]

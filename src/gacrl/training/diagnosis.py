@@ -59,7 +59,7 @@ def diagnose(path: Path, watcher: Watcher | None = None) -> Diagnosis:
         done += 1
         means = jax.device_get(report.metrics)
         metrics = [{name: float(means[name][k]) for name in means} for k in range(config.num_seeds)]
-        broken = list(not_finite(config.seeds, metrics, state.learner))
+        broken = list(not_finite(config.seeds, metrics, state.learner, trainer.algorithm.replay(state.learner)))
         if broken:
             seed = broken[0][0]
             member = config.seeds.index(seed)

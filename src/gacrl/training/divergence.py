@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gacrl.algorithms.replay import Replay
 from gacrl.errors import UserError
 from gacrl.types import Learner
 
@@ -16,18 +17,22 @@ class Diverged(UserError):
 
 
 def not_finite(
-    seeds: Sequence[int], updates: Sequence[Mapping[str, Any]], learners: Learner
+    seeds: Sequence[int],
+    updates: Sequence[Mapping[str, Any]],
+    learners: Learner,
+    replay: Replay[Any] | None = None,
 ) -> Iterator[tuple[int, str, str]]:
     """The seed, name and value of whatever is NaN or infinite: what the updates told of each seed, then its learner.
 
-    learners: stacked over the seeds; gradients show in the optimiser's moments. What a replay remembers is not looked
-    at: it is most of a learner, and what is wrong there shows in the loss.
+    learners: stacked over the seeds; gradients show in the optimiser's moments. replay: the part of them that
+    remembers, which is not looked at: it is most of a learner, and what is wrong there shows in the loss.
     """
+    remembered = {id(leaf) for leaf in jax.tree.leaves(replay)}
     for seed, metrics in zip(seeds, updates, strict=True):
         yield from ((seed, name, str(value)) for name, value in metrics.items() if not np.isfinite(value))
     for path, leaf in jax.tree_util.tree_leaves_with_path(learners):
         name = jax.tree_util.keystr(path).lstrip(".")
-        if name.startswith("replay") or not jnp.issubdtype(leaf.dtype, jnp.inexact):
+        if id(leaf) in remembered or not jnp.issubdtype(leaf.dtype, jnp.inexact):
             continue
         values = np.asarray(leaf)
         if np.isfinite(values).all():
@@ -38,14 +43,36 @@ def not_finite(
                 yield seed, name, f"{bad[0]} in {bad.size} of {member.size} places"
 
 
+class Faulty(UserError):
+    """A task has given an observation or a reward that is no finite number."""
+
+
+def require_sound_task(seeds: Sequence[int], task: str, fault: Any) -> None:
+    """Raises Faulty with the first number of the task that was not finite. fault: as in a chunk's report, [S]."""
+    if fault is None:
+        return
+    for seed, step, agent, reward in zip(seeds, *map(np.asarray, fault), strict=False):
+        if step:
+            what = "got a reward" if reward else "saw a number"
+            raise Faulty(
+                f"agent {agent} of {task} {what} that is not finite, in step {step} of an environment (seed {seed}): "
+                "mend the task"
+            )
+
+
 def require_finite(
-    seeds: Sequence[int], updates: Sequence[Mapping[str, Any]], learners: Learner, before: int, after: int
+    seeds: Sequence[int],
+    updates: Sequence[Mapping[str, Any]],
+    learners: Learner,
+    replay: Replay[Any] | None,
+    before: int,
+    after: int,
 ) -> None:
     """Raises Diverged with the first quantity that is not finite.
 
     before, after: the environment steps between which it happened.
     """
-    for seed, name, value in not_finite(seeds, updates, learners):
+    for seed, name, value in not_finite(seeds, updates, learners, replay):
         raise Diverged(
             f"seed {seed} diverged between environment steps {before} and {after}: {name} is {value}; "
             "try a smaller learning rate"

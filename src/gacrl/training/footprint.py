@@ -7,9 +7,11 @@ from typing import Any
 import jax
 from jaxtyping import PyTree
 
+from gacrl.algorithms.contract import Algorithm
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.training.trainer import TrainState
+from gacrl.types import Learner
 
 _CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -19,7 +21,7 @@ def size(tree: PyTree) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def working_bytes(config: RunConfig, member: TrainState) -> int:
+def working_bytes(config: RunConfig, algorithm: Algorithm, member: TrainState) -> int:
     """What a seed's chunk or evaluation holds at once besides its state, at the least.
 
     member: a seed's training state, or its shapes. Counted are a rollout (every step's observation, before and after),
@@ -29,7 +31,7 @@ def working_bytes(config: RunConfig, member: TrainState) -> int:
     rollout = 2 * carry * config.training.num_steps
     episodes = max(config.evaluation.num_episodes, config.evaluation.final_episodes)
     evaluation = carry // config.training.num_envs * episodes
-    return max(rollout, evaluation, _batch_bytes(config, member.learner))
+    return max(rollout, evaluation, _batch_bytes(algorithm, member.learner))
 
 
 def require_room(needed: int, device: Any) -> None:
@@ -63,13 +65,10 @@ def readable(count: int) -> str:
     return f"{amount:,.1f} {units[unit]}"
 
 
-def _batch_bytes(config: RunConfig, learner: Any) -> int:
+def _batch_bytes(algorithm: Algorithm, learner: Learner) -> int:
     """What a gradient step takes out of the replay, where there is one."""
-    replay = getattr(learner, "replay", None)
+    replay = algorithm.replay(learner)
     if replay is None:
         return 0
-    algorithm: Any = config.algorithm
-    ring = replay.items
-    remembered = ring.size // ring.shape[-1]
-    window = getattr(algorithm, "sequence_length", 1) + getattr(algorithm, "n_step", 1) - 1
-    return size(ring) // remembered * algorithm.batch_size * window
+    remembered = replay.items.size // replay.items.shape[-1]
+    return size(replay.items) // remembered * algorithm.batch_steps

@@ -3,54 +3,78 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from gacrl.algorithms.contract import Algorithm
 from gacrl.errors import UserError
+from gacrl.tasks.task import Task
 from gacrl.training import checkpoint
 from gacrl.training.devices import without_padding
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
+from gacrl.training.trainer import TrainState
 from gacrl.training.writer import Writer
 
-SCORE = "return_agent_mean"
-"""The best policy is the one with the highest greedy mean of this, over all seeds."""
 ROWS = "rows"
 """What a checkpoint calls the number of lines that metrics.jsonl had by then."""
-FOR_LEARNING = (".replay", ".optimizer", ".rewards")
-"""What a learner holds that acting does not need."""
+
+
+class Acting(NamedTuple):
+    """The part of a training state that acts, under the paths that it has in a checkpoint of the whole."""
+
+    learner: Any
 
 
 class Keeper:
-    """Keeps the whole state after every chunk, and the policy where it is the best so far, in the background."""
+    """Keeps the whole state after every chunk, and the policy where it is the best so far, in the background.
 
-    def __init__(self, folder: RunFolder, num_seeds: int, fingerprint: str, writer: Writer, rows: int):
-        self._num_seeds, self._writer, self._rows = num_seeds, writer, rows
+    The best policy is the one whose greedy mean of the task's headline, over all seeds, is best.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        num_seeds: int,
+        algorithm: Algorithm,
+        task: Task,
+        fingerprint: str,
+        writer: Writer,
+        rows: int,
+    ):
+        self._num_seeds, self._algorithm, self._writer, self._rows = num_seeds, algorithm, writer, rows
         self._save = partial(checkpoint.save, folder.checkpoints, fingerprint=fingerprint)
-        self._best = _best_score(folder.checkpoints)
+        self._headline = task.headline
+        self._sign = 1.0 if task.metric(task.headline).higher_is_better else -1.0
+        self._best = self._kept_score(folder.checkpoints)
 
     def __call__(self, progress: Progress) -> None:
-        state = checkpoint.without_empty_rows(checkpoint.arrays(without_padding(progress.whole, self._num_seeds)))
+        """Keep where a run stands."""
+        state = without_padding(progress.whole, self._num_seeds)
         env_steps = progress.env_steps
         self._rows += len(progress.rows)
         counters = {**asdict(progress.clock), ROWS: self._rows}
-        writes = [partial(self._save, checkpoint.serialise(state), env_steps, counters=counters)]
-        score = float(np.mean([row["greedy"][SCORE] for row in progress.rows]))
-        if score > self._best:
-            self._best = score
-            policy = checkpoint.serialise({name: it for name, it in state.items() if acts(name)})
-            writes.append(partial(self._save, policy, env_steps, counters={SCORE: score}, kind=checkpoint.BEST))
+        writes = [partial(self._save, self._serialised(state), env_steps, counters=counters)]
+        score = float(np.mean([row["greedy"][self._headline] for row in progress.rows]))
+        if self._sign * score > self._best:
+            self._best = self._sign * score
+            policy = checkpoint.serialise(checkpoint.arrays(Acting(self._algorithm.acting(state.learner))))
+            kept = {self._headline: score}
+            writes.append(partial(self._save, policy, env_steps, counters=kept, kind=checkpoint.BEST))
         self._writer.submit(lambda: [write() for write in writes])
 
+    def begin(self, state: TrainState) -> None:
+        """Keep a state before any training, for a run that does not begin with fresh parameters."""
+        state = without_padding(state, self._num_seeds)
+        self._writer.submit(partial(self._save, self._serialised(state), 0, counters={ROWS: 0}))
 
-def _best_score(checkpoints: Path) -> float:
-    """Of the best policy that is kept; −∞ where there is none."""
-    try:
-        return checkpoint.newest(checkpoints, checkpoint.BEST)[0].counters[SCORE]
-    except (UserError, KeyError):
-        return -np.inf
+    def _serialised(self, state: TrainState) -> bytes:
+        return checkpoint.serialise(checkpoint.arrays(state, self._algorithm.replay(state.learner)))
 
-
-def acts(name: str) -> bool:
-    """Whether a saved array is one that a policy needs."""
-    return name.startswith(".learner") and not name.removeprefix(".learner").startswith(FOR_LEARNING)
+    def _kept_score(self, checkpoints: Path) -> float:
+        """Of the best policy that is kept, the higher the better; −∞ where there is none."""
+        try:
+            return self._sign * checkpoint.newest(checkpoints, checkpoint.BEST)[0].counters[self._headline]
+        except (UserError, KeyError):
+            return -np.inf

@@ -4,16 +4,17 @@ Whoever watches (command line, recorder, trackers, viewer, sweep) reads the one 
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
+from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.training.devices import gathered, wait_for_all
-from gacrl.training.divergence import require_finite
+from gacrl.training.divergence import require_finite, require_sound_task
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
 
@@ -45,6 +46,8 @@ class Progress:
     """What `metrics.jsonl` gets: one object per seed."""
     state: TrainState
     """The training state, valid until the next chunk starts."""
+    shown: Mapping[str, str]
+    """Metrics of the task that stand in tables, headline first, and what they are called there."""
     whole: TrainState
     """The same; where it is spread over several processes, all of it in each of them."""
 
@@ -73,7 +76,7 @@ def train(
     Yields after every chunk. Raises Diverged after the first one with a loss or a parameter that is not finite.
     """
     clock = Clock() if clock is None else clock
-    per_update = config.steps_per_update
+    per_update, shown = config.steps_per_update, tasks.find(config.task).shown(trainer.table.names)
     done, total = env_steps // per_update, config.num_updates
     started, before = time.perf_counter(), clock
     compiling, training, timed = clock.compiling, clock.training, clock.timed_env_steps
@@ -89,6 +92,7 @@ def train(
         begun = time.perf_counter()
         state, report = jax.block_until_ready(chunk(state, updates))
         training += time.perf_counter() - begun
+        require_sound_task(config.seeds, config.task, jax.device_get(gathered(report.fault)))
         timed += updates * per_update * len(config.seeds)
         done += updates
         begun = time.perf_counter()
@@ -104,10 +108,11 @@ def train(
         clock = Clock(wall, training, compiling, timed)
         whole = gathered(state)
         report, finished = jax.device_get((gathered(report), whole.episodes))
-        rows = _rows(config, report, trainer.metric_names, evaluations, done * per_update, finished, clock)
+        rows = _rows(config, report, trainer.table.names, evaluations, done * per_update, finished, clock)
         told = [row["update"] for row in rows]
-        require_finite(config.seeds, told, whole.learner, (done - updates) * per_update, done * per_update)
-        yield Progress(done * per_update, total * per_update, clock, rows, state, whole)
+        replay = trainer.algorithm.replay(whole.learner)
+        require_finite(config.seeds, told, whole.learner, replay, (done - updates) * per_update, done * per_update)
+        yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole)
 
 
 def _rows(
@@ -153,6 +158,10 @@ def _rows(
 
 
 def _difficulty(env_params: Any, member: int) -> dict[str, float]:
-    """Those parameters of the task that a curriculum moves, where the task has them."""
-    names = ("local_ratio", "coverage_threshold", "arena_scale", "landmark_speed")
-    return {name: float(getattr(env_params, name)[member]) for name in names if hasattr(env_params, name)}
+    """The task's numbers that have a name, as they were in the chunk's last update: a curriculum moves some."""
+    named = env_params._asdict() if hasattr(env_params, "_asdict") else {}
+    return {
+        name: float(values[member])
+        for name, values in named.items()
+        if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype != bool
+    }

@@ -3,24 +3,27 @@
 import json
 import os
 import re
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
+from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
+from gacrl.versions import version
 
 
 class RunFolder:
-    """`config.json`, `metrics.jsonl`, `summary.json`, `checkpoints/` and `episodes/` of one run."""
+    """`config.json`, `origin.json`, `metrics.jsonl`, `summary.json`, `checkpoints/` and `episodes/` of one run."""
 
     def __init__(self, path: Path):
         self.path = path
         self.config_file = path / "config.json"
+        self.origin_file = path / "origin.json"
         self.metrics_file = path / "metrics.jsonl"
         self.summary_file = path / "summary.json"
         self.checkpoints = path / "checkpoints"
@@ -28,10 +31,11 @@ class RunFolder:
         self.gif = path / "episodes.gif"
 
     @classmethod
-    def create(cls, path: Path | None, config: RunConfig) -> "RunFolder":
+    def create(cls, path: Path | None, config: RunConfig, begun_from: str | None = None) -> "RunFolder":
         """A new run folder. Without a path: the next free number under `runs/`.
 
-        Raises UserError where the path exists already, or cannot be written.
+        begun_from: the run whose policy this one starts with. Raises UserError where the path exists already, or cannot
+        be written.
         """
         configuration.from_dict(configuration.to_dict(config))  # refuses now what could not be loaded again
         try:
@@ -45,6 +49,7 @@ class RunFolder:
             folder = cls(path)
             folder.checkpoints.mkdir()
             folder.episodes.mkdir()
+            folder._replace(folder.origin_file, json.dumps(_origin(config, begun_from), indent=2) + "\n")
             folder._replace(folder.config_file, configuration.dumps(config))
             folder.metrics_file.touch()
         except OSError as error:
@@ -73,11 +78,43 @@ class RunFolder:
                 raise UserError(f"{path} is a {found}, and stands where a {wanted} belongs: move it away")
 
     def config(self) -> RunConfig:
-        """The settings that the run was started with."""
+        """The settings that the run was started with. Raises UserError, also for a task that is not at hand."""
         try:
             return configuration.load(self.config_file)
         except ConfigError as error:
+            name = self._task_that_is_missing()
+            if name is not None:
+                raise UserError(
+                    f"{self.path} is of the task {name}, which is not at hand: name its file again, "
+                    "--env FILE.py:NAME, in Python env="
+                ) from error
             raise UserError(str(error)) from error
+
+    def _task_that_is_missing(self) -> str | None:
+        """The task of this run, with its file where that is known; None where it is at hand, or nobody knows it."""
+        try:
+            name = json.loads(self.config_file.read_text(encoding="utf-8"))["env"]["name"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return None
+        if not isinstance(name, str) or name in tasks.names():
+            return None
+        source = self._made().get("source")
+        return f"{name!r} of {source}" if source else repr(name)
+
+    def _made(self) -> dict[str, Any]:
+        """What is known of the task that the run was made in; nothing of a run of version 0.1.0."""
+        try:
+            made = json.loads(self.origin_file.read_text(encoding="utf-8"))["task"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return {}
+        return made if isinstance(made, dict) else {}
+
+    def warn_of_changed_task(self, warn: Callable[[str], None]) -> None:
+        """Say that a task from outside is no longer what it was when the run was made. It goes on all the same."""
+        made, own = self._made(), tasks.brought(self.config().task)
+        if own is not None and made and made.get("sha256") != own.digest:
+            source = own.source or own.task.name
+            warn(f"{source} has changed since {self.path} was made: the task is played as it is now")
 
     def settings(self) -> dict[str, Any]:
         """The same as they stand in the file: a version that knows more settings does not add to them."""
@@ -148,6 +185,15 @@ class RunFolder:
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
+
+
+def _origin(config: RunConfig, begun_from: str | None) -> dict[str, Any]:
+    """What made a run: the version, a task's source where it is not ours, and the run that it starts from."""
+    own = tasks.brought(config.task)
+    task = {"name": config.task}
+    if own is not None:
+        task |= {"source": own.source and own.source.name, "sha256": own.digest}
+    return {"gacrl": version(), "task": task, "from": begun_from}
 
 
 def _is_run(path: Path) -> bool:

@@ -4,23 +4,24 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from gacrl import render
+from gacrl import render, tasks
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
-from gacrl.evaluation import episodes
+from gacrl.evaluation import episodes, references
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
-from gacrl.training.build import Plan, evaluation_env, make_trainer, plan, stacked_shapes
+from gacrl.training.build import Plan, evaluated_settings, make_trainer, member_shapes, plan, stacked_shapes
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
-from gacrl.training.divergence import Diverged
-from gacrl.training.keeper import FOR_LEARNING, ROWS, Keeper
+from gacrl.training.divergence import Diverged, Faulty
+from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
@@ -56,14 +57,53 @@ class Watcher:
     stop: Callable[[], bool] = lambda: False
 
 
-def start(config: RunConfig, out: Path | None = None, watcher: Watcher | None = None) -> Run:
-    """Train from the beginning, into a new run folder."""
+class Parent(NamedTuple):
+    """A trained run whose policy another training starts with."""
+
+    name: str
+    found: checkpoint.Checkpoint
+    num_seeds: int
+    """Seeds in the checkpoint."""
+    member: int | None
+    """The one that all start with; None: each with its own, in turn."""
+
+
+def start(
+    config: RunConfig, out: Path | None = None, watcher: Watcher | None = None, parent: Parent | None = None
+) -> Run:
+    """Train from the beginning, into a new run folder; with the parameters of a parent, where one is given.
+
+    Raises UserError for a parent whose network does not fit.
+    """
     watcher, trainer = watcher or Watcher(), make_trainer(config)
     planned = plan(trainer, config)
-    folder = RunFolder.create(out, config) if leads() else RunFolder(out or Path("runs"))
+    begun = None if parent is None else begin_with(trainer, config, parent)
+    name = None if parent is None else parent.name
+    folder = RunFolder.create(out, config, name) if leads() else RunFolder(out or Path("runs"))
     with folder.locked() if leads() else nullcontext():
         watcher.planned(folder, config, planned)
-        return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config))
+        return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
+
+
+def begin_with(trainer: Trainer, config: RunConfig, parent: Parent) -> TrainState:
+    """A fresh training state, stacked, with what the parent has learned."""
+    state, algorithm = trainer.init_stacked(config.seeds), trainer.algorithm
+    like = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((parent.num_seeds, *leaf.shape), leaf.dtype),
+        algorithm.learned(member_shapes(trainer).learner),
+    )
+    try:
+        learned = checkpoint.load(parent.found, like, prefix=".learner")
+    except UserError as error:
+        why = str(error).partition(": ")[2].partition(";")[0]
+        raise UserError(
+            f"{parent.name} has another network than this run ({why}): train with the preset, the network and the "
+            "observations that it was trained with"
+        ) from error
+    members = [k % parent.num_seeds if parent.member is None else parent.member for k in range(config.num_seeds)]
+    chosen = jax.tree.map(lambda leaf: leaf[jnp.array(members)], learned)
+    kept = {name: part for name, part in chosen._asdict().items() if jax.tree.leaves(part)}
+    return state._replace(learner=state.learner._replace(**kept))
 
 
 def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
@@ -73,6 +113,7 @@ def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None
     with folder.locked() if leads() else nullcontext():
         folder.require_room()
         config = folder.config()
+        folder.warn_of_changed_task(watcher.warn)
         found = newest_checkpoint(folder, watcher.warn)
         if not same_everywhere(-1 if found is None else found.env_steps):
             raise UserError(f"the processes see different checkpoints in {folder.path}: put it where all share it")
@@ -121,7 +162,9 @@ def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | 
     """The training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
-    return shard_seeds(checkpoint.load(found, stacked_shapes(trainer)), trainer.mesh)
+    shapes = stacked_shapes(trainer)
+    replay = trainer.algorithm.replay(shapes.learner)
+    return shard_seeds(checkpoint.load(found, shapes, replay=replay), trainer.mesh)
 
 
 def _run(
@@ -131,9 +174,12 @@ def _run(
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
+    begun: TrainState | None = None,
 ) -> Run:
+    """begun: the state to begin with, stacked, where it is not a fresh one."""
+    again = tasks.flag(config.task)
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
-    state = restore(trainer, config, found)
+    state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
     try:
         rows = folder.forget_metrics_after(env_steps) if leads() else 0
         if leads() and found is not None and rows != found.counters.get(ROWS, rows):
@@ -142,7 +188,10 @@ def _run(
                 f"environment step {env_steps}: the others are lost, what follows is not"
             )
         with Writer() as writer:
-            keep = Keeper(folder, config.num_seeds, fingerprint, writer, rows)
+            task = tasks.find(config.task)
+            keep = Keeper(folder, config.num_seeds, trainer.algorithm, task, fingerprint, writer, rows)
+            if begun is not None and leads():
+                keep.begin(gathered(state))
             for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
                 env_steps, state, clock = progress.env_steps, progress.state, progress.clock
                 if leads():
@@ -156,13 +205,17 @@ def _run(
         summary = _finish(folder, config, trainer, state, env_steps, clock)
     except Diverged as error:
         raise Diverged(
-            f"{error}, or see the first bad update with `gacrl resume {folder.path} --diagnose`, which begins at "
-            f"{'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
+            f"{error}, or see the first bad update with `gacrl resume {folder.path}{again} --diagnose`, which begins "
+            f"at {'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
+        ) from error
+    except Faulty as error:
+        raise Faulty(
+            f"{error}, then go on with `gacrl resume {folder.path}{again}` from environment step {env_steps}"
         ) from error
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
-            f"then `gacrl resume {folder.path}` goes on from the last checkpoint"
+            f"then `gacrl resume {folder.path}{again}` goes on from the last checkpoint"
         ) from error
     return Run(folder.path, config, env_steps, summary)
 
@@ -178,7 +231,7 @@ def _finish(
 ) -> dict[str, Any]:
     """The closing evaluation, some episodes to look at, and the summary."""
     num_episodes = config.evaluation.final_episodes
-    env = evaluation_env(config)
+    task, settings = tasks.find(config.task), evaluated_settings(config)
     final = {
         kind: jax.device_get(gathered(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes)))
         for kind in ("greedy", "sampled")
@@ -186,38 +239,57 @@ def _finish(
     learner = one_seed(gathered(state.learner), 0)
     if not leads():
         return {}
-    references = evaluate_scripted(env, num_episodes)
+    references, facts = (
+        evaluate_scripted(config.task, settings, num_episodes),
+        task.facts(settings, trainer.table.names),
+    )
     members = len(config.seeds)
     summary = {
         "preset": config.preset,
+        "task": facts,
         "seeds": list(config.seeds),
         "env_steps": env_steps,
         "final": {
-            kind: normalised(over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references)
+            kind: normalised(
+                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references, facts["scale"]
+            )
             for kind, values in final.items()
         },
         "references": references,
         "episodes": num_episodes,
-        "horizon": env.max_cycles,
+        "horizon": trainer.evaluation_env.max_cycles,
         "steps_per_second": clock.steps_per_second,
         "compile_seconds": clock.compiling,
         "wall_seconds": clock.wall,
         "versions": versions(),
     }
     folder.write_summary(summary)
-    policy = trainer.algorithm.policy(learner, False)
+    _show(folder, config, trainer, learner)
+    return summary
+
+
+def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learner) -> None:
+    """Some episodes of the first seed to look at, and as a GIF where there is something to see."""
+    task = tasks.find(config.task)
     shown = episodes.record_many(
-        env, policy, trainer.memory, env.default_params(), stream_key("report"), SHOWN_EPISODES
+        trainer.evaluation_env,
+        trainer.algorithm.policy(learner, False),
+        trainer.memory,
+        trainer.evaluation_params,
+        stream_key("report"),
+        SHOWN_EPISODES,
+        look=references.look_of(task, evaluated_settings(config)),
     )
     folder.episodes.mkdir(exist_ok=True)
     for number, episode in enumerate(shown):
         episode.save(folder.episodes / f"{number}.npz")
-    render.gif(shown, folder.gif, title=f"{config.preset}, seed {config.seed}")
-    return summary
+    if shown and shown[0].scene is not None:
+        title = f"{config.preset}, seed {config.seed}"
+        render.gif(shown, folder.gif, title=title, words=task.words)
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
-    shapes = stacked_shapes(trainer).learner
-    learners = checkpoint.load(found, shapes, prefix=".learner", skip=FOR_LEARNING)
+    shapes = trainer.algorithm.acting(stacked_shapes(trainer).learner)
+    learners = checkpoint.load(found, shapes, prefix=".learner")
     return shard_seeds(learners, trainer.mesh)

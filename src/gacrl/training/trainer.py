@@ -3,13 +3,14 @@
 A trainer knows no particular algorithm; what it trains is an `Algorithm` record.
 """
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gacrl import rollout
 from gacrl.algorithms.contract import Algorithm, Hyper
@@ -21,14 +22,16 @@ from gacrl.evaluation.metrics import (
     Tally,
     count_step,
     episode_metrics,
-    metric_names,
+    measures_of,
     no_episodes,
     no_steps,
     sum_up,
+    table_of,
 )
+from gacrl.tasks.task import RETURN, Metric
 from gacrl.training.curriculum import Curriculum, CurriculumState
 from gacrl.training.devices import compiler_options, map_seeds, mesh_for, shard_seeds, stack_seeds
-from gacrl.types import Learner, Metrics, PRNGKey
+from gacrl.types import Learner, Metrics, PRNGKey, Transition
 
 
 class TrainState(NamedTuple):
@@ -46,6 +49,35 @@ class TrainState(NamedTuple):
     updates: Int[Array, ""]
 
 
+class Fault(NamedTuple):
+    """The first observation or reward of a chunk that is not a finite number."""
+
+    step: Int[Array, ""]
+    """Environment steps that its copy had taken since training began, this one included; 0 for none."""
+    agent: Int[Array, ""]
+    reward: Bool[Array, ""]
+    """It is a reward, and not an observation."""
+
+
+def find_fault(steps: Transition, updates: Int[Array, ""]) -> Fault:
+    """The first fault of a rollout [T, E, …], after so many updates."""
+    seen = ~jnp.isfinite(steps.observation.features).all(-1)
+    earned = ~jnp.isfinite(steps.reward)
+    bad = jnp.stack([seen, earned], -1)  # [T E N 2]
+    first = jnp.argmax(bad.any((1, 2, 3)))
+    _, agent, kind = jnp.unravel_index(jnp.argmax(bad[first]), bad.shape[1:])
+    step = updates * bad.shape[0] + first + 1
+    return Fault(jnp.where(bad.any(), step, 0), agent, kind == 1)
+
+
+def earlier(first: Fault | None, fault: Fault | None) -> Fault | None:
+    """The first of two faults, one after the other; None where nobody looks."""
+    if first is None or fault is None:
+        return None
+    known = first.step > 0
+    return jax.tree.map(lambda old, new: jnp.where(known, old, new), first, fault)
+
+
 class ChunkReport(NamedTuple):
     """What a chunk of updates showed."""
 
@@ -54,6 +86,8 @@ class ChunkReport(NamedTuple):
     """The update's own metrics (losses, exploration), their mean over the chunk."""
     env_params: EnvParams
     """The task's parameters in the chunk's last update."""
+    fault: Fault | None = None
+    """The first number of the task that was not finite; None where nobody looks."""
 
 
 class Trainer:
@@ -74,7 +108,13 @@ class Trainer:
         evaluation_env: Environment | None = None,
         mesh: Mesh | None = None,
         for_speed: bool = True,
+        params: EnvParams = None,
+        evaluation_params: EnvParams = None,
+        metrics: Mapping[str, Metric] = RETURN,
+        watched: bool = False,
     ):
+        """params: the task's numbers, in training and as evaluated; None: those of the environments. metrics: the
+        task's. watched: look for observations and rewards that are not finite."""
         self.algorithm = algorithm
         self.env = env
         self.curriculum = curriculum
@@ -84,11 +124,15 @@ class Trainer:
         self.for_speed = for_speed
         """How `chunk` is compiled: see `devices.compiler_options`."""
         self.evaluation_env = env if evaluation_env is None else evaluation_env
+        self.params = env.default_params() if params is None else params
+        self.evaluation_params = (
+            self.evaluation_env.default_params() if evaluation_params is None else evaluation_params
+        )
+        self.metrics, self.watched = metrics, watched
         self.mesh = mesh_for(num_seeds) if mesh is None else mesh
         """The devices that the seeds, and perhaps their environments, are spread over."""
         self.memory = algorithm.initial_memory(env.num_agents)
-        self.measures = _measures(env)
-        self.metric_names = metric_names(self.measures)
+        self.table = table_of(measures_of(env, self.params), metrics)
         """What the vectors of a chunk's episode summary hold."""
         self.chunk = jax.jit(
             map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=compiler_options(for_speed)
@@ -105,14 +149,14 @@ class Trainer:
 
     def init_member(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None) -> TrainState:
         """A fresh training state of one seed, with these hyperparameters in this task."""
-        return self._init(key, hyper, self.env.default_params() if params is None else params)
+        return self._init(key, hyper, self.params if params is None else params)
 
     @partial(jax.jit, static_argnums=0)
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
         learner_key, start_key, key = jax.random.split(key, 3)
         curriculum, params = self.curriculum.init(params)
         carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs)
-        tally = jax.vmap(lambda _: no_steps(self.measures))(jnp.arange(self.num_envs))
+        tally = jax.vmap(lambda _: no_steps(self.table))(jnp.arange(self.num_envs))
         return TrainState(
             learner=self.algorithm.init(learner_key, hyper),
             carry=carry,
@@ -124,7 +168,7 @@ class Trainer:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def _update(self, state: TrainState) -> tuple[TrainState, EpisodeSummary, Metrics]:
+    def _update(self, state: TrainState) -> tuple[TrainState, EpisodeSummary, Metrics, Fault | None]:
         """Gather experience, learn from it, move the task on: one turn of the loop."""
         rollout_key, update_key, key = jax.random.split(state.key, 3)
         carry, experience = rollout.collect(
@@ -141,17 +185,18 @@ class Trainer:
         curriculum, env_params = self.curriculum.advance(state.curriculum, env_steps, experience)
         tally, episodes = self._count(state.tally, experience)
         finished = state.episodes + episodes.ended
+        fault = find_fault(experience.transitions, state.updates) if self.watched else None
         state = TrainState(learner, carry, env_params, curriculum, tally, finished, key, state.updates + 1)
-        return state, episodes, metrics
+        return state, episodes, metrics, fault
 
     def _count(self, tally: Tally, experience: rollout.Rollout) -> tuple[Tally, EpisodeSummary]:
         """Follow the episodes of a rollout, and sum up those that ended in it."""
-        fresh = no_steps(self.measures)
+        fresh = no_steps(self.table)
 
         def one_step(tally: Tally, step: tuple[Any, Bool[Array, " E"]]):
             info, done = step
             tally = jax.vmap(count_step)(tally, info)
-            episodes = jax.vmap(lambda tally: episode_metrics(tally, self.measures))(tally)
+            episodes = jax.vmap(lambda tally: episode_metrics(tally, self.table))(tally)
             over = jax.vmap(lambda done, tally: jax.tree.map(lambda n, o: jnp.where(done, n, o), fresh, tally))
             return over(done, tally), episodes
 
@@ -168,47 +213,36 @@ class Trainer:
         """`num_updates` turns of the loop, for one seed."""
         update = jax.jit(self._update, inline=True)  # traced once for the shapes and the loop
 
-        def body(_: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams]):
-            state, seen, totals, _ = loop
+        def body(
+            _: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams, Fault | None]
+        ) -> tuple[TrainState, EpisodeSummary, Metrics, EnvParams, Fault | None]:
+            state, seen, totals, _, first = loop
             used = state.env_params
-            state, episodes, metrics = update(state)
+            state, episodes, metrics, fault = update(state)
             seen = EpisodeSummary(
                 ended=seen.ended + episodes.ended,
                 total=seen.total + episodes.total,
                 squares=seen.squares + episodes.squares,
                 last=jnp.where(episodes.ended > 0, episodes.last, seen.last),
             )
-            return state, seen, jax.tree.map(jnp.add, totals, metrics), used
+            return state, seen, jax.tree.map(jnp.add, totals, metrics), used, earlier(first, fault)
 
-        shapes = jax.eval_shape(update, state)[2]
-        zeros: PyTree = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        state, seen, totals, used = jax.lax.fori_loop(
-            0, num_updates, body, (state, no_episodes(self.measures), zeros, state.env_params)
-        )
+        _, _, shapes, fault = jax.eval_shape(update, state)
+        zeros, unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (shapes, fault))
+        start = (state, no_episodes(self.table), zeros, state.env_params, unseen)
+        state, seen, totals, used, fault = jax.lax.fori_loop(0, num_updates, body, start)
         metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), totals)
-        return state, ChunkReport(seen, metrics, used)
+        return state, ChunkReport(seen, metrics, used, fault)
 
     @partial(jax.jit, static_argnums=(0, 2, 3, 4))
     def evaluate(
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[Array, "S K"]]:
         """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""
-        env = self.evaluation_env
+        env, params = self.evaluation_env, self.evaluation_params
 
         def one(learner: Learner) -> dict[str, Float[Array, " K"]]:
-            policy = self.algorithm.policy(learner, explore)
-            return evaluate(env, policy, self.memory, env.default_params(), stream_key(stream), num_episodes)
+            policy, key = self.algorithm.policy(learner, explore), stream_key(stream)
+            return evaluate(env, policy, self.memory, params, key, num_episodes, metrics=self.metrics)
 
         return map_seeds(one, self.mesh)(learners)
-
-
-def _measures(env: Environment) -> list[str]:
-    """The names, sorted, of what a step of this task measures."""
-
-    def info() -> Metrics:
-        key, params = jax.random.key(0), env.default_params()
-        shape = (env.num_agents, env.num_actions)
-        action = jnp.zeros(shape) if env.continuous_actions else jnp.zeros(shape[0], jnp.int32)
-        return env.step(env.reset(key, params)[0], action, key, params)[1].info
-
-    return sorted(jax.eval_shape(info))
