@@ -4,13 +4,15 @@ import contextlib
 import difflib
 import io
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
+from gacrl import tasks
 from gacrl.config import presets
+from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 
@@ -43,6 +45,36 @@ class Cluster:
 
 
 @dataclass(frozen=True)
+class Outside:
+    """What does not come with the package; both are taken before anything else is understood."""
+
+    env: str | None = None
+    """The task: a name (`gacrl tasks`), or FILE.py:NAME, a Task, a subclass of Environment or an instance in that file,
+    which is run. Its settings are the flags --env.X."""
+    use: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """A Python file to run first: it adds messages, exploration rules or algorithms (examples/)."""
+
+
+ON_TASK = Annotated[Outside, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True)
+class Settings(RunConfig):
+    """Everything that determines a run; the task is named by --env."""
+
+    task: Annotated[str, tyro.conf.Suppress] = tasks.DEFAULT
+
+    @classmethod
+    def of(cls, config: RunConfig) -> "Settings":
+        """The same settings."""
+        return cls(**{field.name: getattr(config, field.name) for field in fields(RunConfig)})
+
+    def plain(self) -> RunConfig:
+        """The same settings, as everyone else has them."""
+        return RunConfig(**{field.name: getattr(self, field.name) for field in fields(RunConfig)})
+
+
+@dataclass(frozen=True)
 class Train:
     """Train, with a live progress line, and write a run folder.
 
@@ -53,9 +85,14 @@ class Train:
       gacrl train --preset paper --num-seeds 2        the paper's whole schedule, a seed on each core
       gacrl train --preset paper --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
       gacrl train --config my.json --seed 7           `gacrl config` prints such a file
+      gacrl train --env examples/own_task.py:Beacon --env.places 7    a task of your own
+      gacrl train --from runs/gacrl-1                 start with the policy of a run
     """
 
-    settings: Annotated[RunConfig, tyro.conf.arg(name="")]
+    settings: Annotated[Settings, tyro.conf.arg(name="")]
+    outside: ON_TASK = Outside()
+    begin_from: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Start with what a run has learned: a folder, FOLDER@k or FOLDER@best, or pretrained:NAME."""
     config: Path | None = None
     """A JSON file of settings, all or some."""
     env_steps: int | None = None
@@ -86,6 +123,7 @@ class Resume:
     diagnose: bool = False
     """Play what follows the newest checkpoint again, one update at a time, and print the first that is not finite;
     nothing is written."""
+    outside: ON_TASK = Outside()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -93,11 +131,12 @@ class Resume:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a policy on fixed episodes: greedy and sampled, beside random, noop and oracle.
+    """Measure a policy on fixed episodes: greedy and sampled, beside policies that learn nothing.
 
-    RUN is a run folder, FOLDER@k for its member k, FOLDER@best for how it was when it scored best, or random, noop,
-    oracle, or local (an oracle that sees what is near and assigns nothing). Every score_ is 0 for random and 1 for
-    oracle on the same starts.
+    RUN is a run folder, FOLDER@k for its member k, FOLDER@best for how it was when it scored best, or random, noop, or
+    a scripted policy of the task: of spread oracle, or local (an oracle that sees what is near and assigns nothing).
+    Every score_ is 0 for random and 1 for the first of the task's own. Flags --env.X change the task's settings; --X is
+    short for them where no other flag has that name.
 
     examples:
       gacrl evaluate runs/paper-1
@@ -109,20 +148,21 @@ class Evaluate:
     episodes: int = 320
     """Episodes to play."""
     horizon: int | None = None
-    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    """Steps of an episode (short for --env.max-cycles); none: as in training (the task's own for scripted policies)."""
     backend: Literal["jax", "mpe2"] = "jax"
     """Our environment, or the real MPE2."""
     num_agents: int | None = None
-    """Play with another number of agents and landmarks."""
-    arena_scale: float | None = None
-    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    """Play with another number of agents (short for --env.num-agents)."""
+    outside: ON_TASK = Outside()
     json: bool = False
     """Make the last line of the output one JSON object."""
 
 
 @dataclass(frozen=True)
 class Render:
-    """Draw episodes as an animated GIF: agents, landmarks, edges, message symbols, coverage.
+    """Draw episodes as an animated GIF: what the task shows, who hears whom, and what is said.
+
+    Flags --env.X change the task's settings, as in `gacrl evaluate`.
 
     examples:
       gacrl render runs/paper-1 --out paper.gif
@@ -135,11 +175,10 @@ class Render:
     episodes: int = 4
     """Episodes to show."""
     horizon: int | None = None
-    """Steps of an episode; none: as in training (25 for scripted policies)."""
+    """Steps of an episode (short for --env.max-cycles); none: as in training (the task's own for scripted policies)."""
     num_agents: int | None = None
-    """Play with another number of agents and landmarks."""
-    arena_scale: float | None = None
-    """Play in another arena: starts uniform in [-scale, scale] squared."""
+    """Play with another number of agents (short for --env.num-agents)."""
+    outside: ON_TASK = Outside()
     sampled: bool = False
     """Explore as in training, instead of playing greedily."""
     size: int = 480
@@ -164,7 +203,8 @@ class Compare:
     run: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders."""
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A metric of the closing evaluation; may be given several times. None: return and coverage within 0.1."""
+    """A metric of the closing evaluation; may be given several times. None: the first two of the task's tables."""
+    outside: ON_TASK = Outside()
     margin: float | None = None
     """Also test whether groups differ by less than this, in the units of the one metric (two one-sided tests)."""
     sampled: bool = False
@@ -192,6 +232,20 @@ class Presets:
 
 
 @dataclass(frozen=True)
+class Tasks:
+    """List what can be trained on, with the scores of policies that learn nothing, and of silent and of told ones.
+
+    examples:
+      gacrl tasks
+      gacrl tasks --env examples/own_task.py:Beacon    one of your own beside them
+    """
+
+    outside: ON_TASK = Outside()
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Config:
     """Print a preset's settings, complete, as a file that `gacrl train --config FILE` loads.
 
@@ -201,6 +255,7 @@ class Config:
 
     preset: str = presets.DEFAULT_PRESET
     """Which preset."""
+    outside: ON_TASK = Outside()
 
 
 @dataclass(frozen=True)
@@ -251,6 +306,7 @@ class Ablate:
     """Environment steps of each seed; none: the preset's."""
     updates: int | None = None
     """Gradient steps after each rollout; none: half of the preset's; all of it takes about an hour on two cores."""
+    outside: ON_TASK = Outside()
     out: Path = Path("runs/ablation")
     """The folder of the runs and the report."""
     json: bool = False
@@ -285,6 +341,7 @@ class Sweep:
     """Seeds of each point of paper-grid; none: 2."""
     episodes: int | None = None
     """Episodes of each seed of paper-grid; none: 500."""
+    outside: ON_TASK = Outside()
     out: Path | None = None
     """The folder of the results and the report; none: runs/ and the name of the file or grid."""
     json: bool = False
@@ -305,17 +362,61 @@ class Doctor:
 
 def parse(kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None) -> Arguments:
     """The arguments by their dataclass. Raises UserError with one sentence for what cannot be understood."""
+    return _parsed(kind, words, command, default, False)
+
+
+def parse_known(kind: type[Arguments], words: list[str], command: str) -> tuple[Arguments, list[str]]:
+    """The same, and the words that are none of its flags."""
+    return _parsed(kind, words, command, None, True)
+
+
+def _parsed(kind: Any, words: list[str], command: str, default: Any, rest_is_returned: bool) -> Any:
     given: dict[str, Any] = {} if default is None else {"default": default}
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                kind, prog=f"gacrl {command}", args=words, config=(tyro.conf.AvoidSubcommands,), **given
+                kind,
+                prog=f"gacrl {command}",
+                args=words,
+                config=(tyro.conf.AvoidSubcommands,),
+                return_unknown_args=rest_is_returned,
+                **given,
             )
     except SystemExit as stop:
         if stop.code == 0:
             raise
         raise UserError(_sentence(said.getvalue(), command)) from None
+
+
+@dataclass(frozen=True)
+class _Changed:
+    env: Any
+
+
+def changed(settings: Any, words: list[str], command: str, kind: type) -> Any:
+    """A task's settings with those that `--env.X V`, or `--X V`, say.
+
+    kind: the arguments of the command, whose other flags may be meant. Raises UserError (ConfigError out of range).
+    """
+    names = {field.name.replace("_", "-"): field.name for field in fields(settings)}
+    flags: list[str] = []
+    for word in words:
+        name, equals, value = word.partition("=")
+        bare = name.removeprefix("--").removeprefix("env.").replace("_", "-")
+        if not name.startswith("--"):
+            flags.append(word)
+        elif bare.removeprefix("no-") in names or bare in names:
+            flags.append(f"--env.{bare}{equals}{value}")
+        elif name.startswith("--env."):
+            raise UserError(unknown("setting", f"env.{bare}", {f"env.{known}" for known in names}))
+        else:
+            flags_of = [f"--{known.name.replace('_', '-')}" for known in fields(kind)]
+            known = [*flags_of, *(f"--{known}" for known in names)]
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+            mend = f"did you mean {near[0]}?" if near else f"see `gacrl {command} --help`"
+            raise UserError(f"unrecognized option {name}: {mend}")
+    return parse(_Changed, flags, command, _Changed(settings)).env
 
 
 def _sentence(box: str, command: str) -> str:

@@ -8,10 +8,11 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
@@ -19,7 +20,7 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 
 if TYPE_CHECKING:
-    from gacrl.cli.arguments import Cluster, Resume, Sweep
+    from gacrl.cli.arguments import Cluster, Evaluate, Render, Resume, Sweep
     from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.paper.reproduce import Reproduction
@@ -40,6 +41,7 @@ usage: gacrl COMMAND [OPTIONS]
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
   sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
+  tasks      what can be trained on; a task of your own is --env FILE.py:NAME
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -66,7 +68,7 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         if words[0] not in _COMMANDS:
             raise UserError(unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
-        return _COMMANDS[words[0]](words[1:])
+        return _run(words[0], words[1:])
     except UserError as error:
         print(f"gacrl: {error}", file=sys.stderr)
         return 2
@@ -92,24 +94,82 @@ def main(words: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _train(words: list[str]) -> int:
+class _Words(list[str]):
+    """The words of a command, without --env NAME and --use FILE; `task` is the name that --env gave."""
+
+    task: str | None = None
+
+
+def _run(command: str, words: list[str]) -> int:
+    """Run a command, with the task and the files that come from outside at hand.
+
+    What code of theirs raises is told with its file and line.
+    """
+    rest, named = _Words(), {"--env": [], "--use": []}
+    following = iter(words)
+    for word in following:
+        flag, equals, value = word.partition("=")
+        if flag not in named:
+            rest.append(word)
+            continue
+        value = value if equals else next(following, "")
+        if not value or value.startswith("--"):
+            raise UserError(f"{flag} needs a value: see `gacrl {command} --help`")
+        named[flag].append(value)
+    if not any(named.values()):
+        return _COMMANDS[command](rest)
+    if command not in _ON_TASK:
+        raise UserError(f"`gacrl {command}` takes no {'--env' if named['--env'] else '--use'}")
+    with contextlib.ExitStack() as blame:
+        for file in named["--use"]:
+            from gacrl.tasks import own
+
+            blame.enter_context(own.blamed(Path(file)))
+            own.run_file(Path(file))
+        for name in named["--env"]:
+            rest.task = _bring(name, blame)
+        return _COMMANDS[command](rest)
+
+
+def _bring(name: str, blame: contextlib.ExitStack) -> str:
+    """Have the task at hand that --env names, and return its name."""
+    if ":" not in name:
+        tasks.default_settings(name)
+        return name
+    from gacrl.tasks import own
+
+    task, _ = own.bring(name)
+    known = tasks.brought(task)
+    blame.enter_context(own.blamed(known.source if known else None))
+    return task
+
+
+def _train(words: _Words) -> int:
     from gacrl.cli import arguments
 
-    words = ["--env.name" if word == "--env" else word for word in words]
-    asked = arguments.parse(arguments.Train, words, "train", default=arguments.Train(_base_settings(words)))
-    config = asked.settings
+    base = arguments.Settings.of(_base_settings(words))
+    asked = arguments.parse(arguments.Train, words, "train", default=arguments.Train(base))
+    config = asked.settings.plain()
     if asked.env_steps is not None and asked.episodes is not None:
         raise UserError("--env-steps and --episodes say the same thing: give one of them")
-    env_steps = asked.env_steps if asked.episodes is None else asked.episodes * config.env.max_cycles
+    env_steps = asked.env_steps if asked.episodes is None else asked.episodes * _horizon(config)
     if env_steps is not None:
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def start(watcher: "Watcher") -> "Run":
+        from gacrl import play
         from gacrl.training import session
 
-        return session.start(config, asked.out, watcher)
+        parent = None if asked.begin_from is None else play.parent(asked.begin_from, watcher.warn)
+        return session.start(config, asked.out, watcher, parent)
 
     return _watched(start, asked.json, config, asked.cluster)
+
+
+def _horizon(config: RunConfig) -> int:
+    """Steps of an episode."""
+    steps = getattr(config.env, "max_cycles", None)
+    return tasks.find(config.task).make(config.env).max_cycles if steps is None else steps
 
 
 def _resume(words: list[str]) -> int:
@@ -192,7 +252,7 @@ def _stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
             signal.signal(number, old)
 
 
-def _base_settings(words: list[str]) -> RunConfig:
+def _base_settings(words: _Words) -> RunConfig:
     """The settings under the flags: the preset's, then those of --config; both change what --help shows."""
     named: dict[str, str] = {}
     for word, following in zip(words, [*words[1:], ""], strict=False):
@@ -201,16 +261,34 @@ def _base_settings(words: list[str]) -> RunConfig:
             named[flag] = value or following
             if not named[flag] or named[flag].startswith("--"):
                 raise UserError(f"{flag} needs a value: see `gacrl train --help`")
-    if "--config" not in named:
-        return presets.preset(named.get("--preset", presets.DEFAULT_PRESET))
     base = presets.preset(named["--preset"]) if "--preset" in named else None
-    return configuration.load(Path(named["--config"]), base)
+    if "--config" in named:
+        base = configuration.load(Path(named["--config"]), base)
+    base = presets.preset() if base is None else base
+    return base if words.task is None else configuration.on_task(base, words.task)
 
 
-def _evaluate(words: list[str]) -> int:
+def _changes(asked: "Evaluate | Render", rest: list[str], command: str) -> Callable[[Any], Any]:
+    """What the flags change about the task that is played."""
     from gacrl.cli import arguments
 
-    asked = arguments.parse(arguments.Evaluate, words, "evaluate")
+    short = {"--horizon": ("max_cycles", asked.horizon), "--num-agents": ("num_agents", asked.num_agents)}
+    asked_for = {flag: (name, value) for flag, (name, value) in short.items() if value is not None}
+
+    def change(settings: Any) -> Any:
+        for flag, (name, _) in asked_for.items():
+            if name not in {field.name for field in fields(settings)}:
+                raise UserError(f"the task has no setting {name}: leave {flag} out")
+        flags = [word for name, value in asked_for.values() for word in (f"--env.{name}", str(value))]
+        return arguments.changed(settings, [*rest, *flags], command, type(asked))
+
+    return change
+
+
+def _evaluate(words: _Words) -> int:
+    from gacrl.cli import arguments
+
+    asked, rest = arguments.parse_known(arguments.Evaluate, words, "evaluate")
     if asked.episodes < 1:
         raise UserError(f"--episodes must be at least 1, not {asked.episodes}")
     from gacrl.training.devices import prepare_jax
@@ -222,9 +300,10 @@ def _evaluate(words: list[str]) -> int:
     scores = scoring.score_run(
         asked.run,
         episodes=asked.episodes,
-        changes=scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale),
+        change=_changes(asked, rest, "evaluate"),
         backend=asked.backend,
         warn=_warn,
+        task=words.task or tasks.DEFAULT,
     )
     print_evaluation(scores)
     if asked.json:
@@ -232,10 +311,10 @@ def _evaluate(words: list[str]) -> int:
     return 0
 
 
-def _render(words: list[str]) -> int:
+def _render(words: _Words) -> int:
     from gacrl.cli import arguments
 
-    asked = arguments.parse(arguments.Render, words, "render")
+    asked, rest = arguments.parse_known(arguments.Render, words, "render")
     if not 1 <= asked.episodes <= 100:
         raise UserError(f"--episodes must be between 1 and 100, not {asked.episodes}")
     if not 120 <= asked.size <= 4096:
@@ -250,10 +329,14 @@ def _render(words: list[str]) -> int:
     from gacrl import render
     from gacrl.experiments import scoring
 
-    changes = scoring.Changes(asked.horizon, asked.num_agents, asked.arena_scale)
-    shown = scoring.record_run(asked.run, asked.episodes, changes, asked.sampled, _warn)
-    render.gif(shown, asked.out, size=asked.size, title=asked.run)
-    print(f"{asked.out}: {len(shown)} episodes of {asked.run}")
+    change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
+    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task)
+    if shown.episodes[0].scene is None:
+        raise UserError(
+            f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
+        )
+    render.gif(shown.episodes, asked.out, size=asked.size, title=asked.run, words=shown.task.words)
+    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}")
     return 0
 
 
@@ -270,7 +353,7 @@ def _compare(words: list[str]) -> int:
         if path is not None and path.exists() and not asked.overwrite:
             raise UserError(f"{path} exists: choose another place, or say --overwrite")
     play = "sampled" if asked.sampled else "greedy"
-    comparison = compare.compare(asked.run, asked.metric or compare.METRICS, play, _warn, asked.margin)
+    comparison = compare.compare(asked.run, asked.metric, play, _warn, asked.margin)
     compare_report.print_comparison(comparison)
     if asked.out is not None:
         print(f"page       {compare_report.write_page(comparison, asked.out)}")
@@ -315,7 +398,7 @@ def _studied(
     return 0
 
 
-def _ablate(words: list[str]) -> int:
+def _ablate(words: _Words) -> int:
     from gacrl.cli import arguments
 
     asked = arguments.parse(arguments.Ablate, words, "ablate")
@@ -326,18 +409,21 @@ def _ablate(words: list[str]) -> int:
 
     def study(watch: "Watch") -> "Ablation | None":
         config = replace(presets.preset(asked.preset), seed=asked.seed)
+        config = config if words.task is None else configuration.on_task(config, words.task)
         return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
 
     return _studied(study, asked.out, asked.json)
 
 
-def _sweep(words: list[str]) -> int:
+def _sweep(words: _Words) -> int:
     from gacrl.cli import arguments
 
     asked = arguments.parse(arguments.Sweep, words, "sweep")
     out = asked.out or Path("runs") / Path(asked.spec).stem
     if asked.spec != "paper-grid":
-        return _search(asked, out)
+        return _search(asked, out, words.task)
+    if words.task is not None:
+        raise UserError("paper-grid is the paper's, on its own task: leave --env out")
     if asked.ray is not None:
         raise UserError("paper-grid is one compiled program and needs no cluster: leave --ray out")
     seeds = 2 if asked.seeds is None else asked.seeds
@@ -354,7 +440,7 @@ def _sweep(words: list[str]) -> int:
     return 0
 
 
-def _search(asked: "Sweep", out: Path) -> int:
+def _search(asked: "Sweep", out: Path, task: str | None) -> int:
     """A search that a file describes, here or on a cluster."""
     if asked.seeds is not None or asked.episodes is not None:
         raise UserError(f"--seeds and --episodes are for paper-grid: say seeds and env_steps in {asked.spec}")
@@ -363,7 +449,7 @@ def _search(asked: "Sweep", out: Path) -> int:
     from gacrl.experiments import search
     from gacrl.training.devices import prepare_jax
 
-    spec = search.load(Path(asked.spec))
+    spec = search.load(Path(asked.spec), task)
     prepare_jax(spec.config.num_seeds)
 
     def study(watch: "Watch") -> "search.Search | None":
@@ -388,11 +474,27 @@ def _presets(words: list[str]) -> int:
     return 0
 
 
-def _config(words: list[str]) -> int:
+def _tasks(words: list[str]) -> int:
+    from gacrl.cli import arguments
+
+    asked = arguments.parse(arguments.Tasks, words, "tasks")
+    from gacrl.experiments import anchors
+
+    rows = [anchors.row(name) for name in tasks.names()]
+    for row in rows:
+        print(anchors.sentence(row))
+    if asked.json:
+        print(json.dumps({row["task"]: row for row in rows}))
+    return 0
+
+
+def _config(words: _Words) -> int:
     from gacrl.cli import arguments
 
     asked = arguments.parse(arguments.Config, words, "config")
-    print(configuration.dumps(presets.preset(asked.preset)), end="")
+    config = presets.preset(asked.preset)
+    config = config if words.task is None else configuration.on_task(config, words.task)
+    print(configuration.dumps(config), end="")
     return 0
 
 
@@ -420,7 +522,7 @@ def _warn(sentence: str) -> None:
     print(f"gacrl: {sentence}", file=sys.stderr)
 
 
-_COMMANDS: dict[str, Callable[[list[str]], int]] = {
+_COMMANDS: dict[str, Callable[[Any], int]] = {
     "train": _train,
     "resume": _resume,
     "evaluate": _evaluate,
@@ -429,7 +531,10 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "reproduce": _reproduce,
     "ablate": _ablate,
     "sweep": _sweep,
+    "tasks": _tasks,
     "presets": _presets,
     "config": _config,
     "doctor": _doctor,
 }
+_ON_TASK = ("train", "resume", "evaluate", "render", "compare", "ablate", "sweep", "tasks", "config")
+"""Commands that take a task from outside."""

@@ -12,21 +12,13 @@ from rich.spinner import Spinner
 from rich.table import Table
 from rich.text import Text
 
+from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.footprint import readable
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Plan, Run, Watcher
-
-_SHOWN = {
-    "return_agent_mean": "return",
-    "coverage_final_0.1": "coverage 0.1",
-    "coverage_final_0.2": "coverage 0.2",
-    "success_final_0.1": "all covered",
-    "distance_landmark_agent": "distance",
-    "collisions": "collisions",
-}
 
 
 class TerminalWatcher:
@@ -70,10 +62,10 @@ class TerminalWatcher:
         )
 
     def _planned(self, folder: RunFolder, config: RunConfig, plan: Plan) -> None:
-        env, say = config.env, self._print
+        say = self._print
         seeds = ", ".join(str(seed) for seed in config.seeds)
         say(f"run        {folder.path}")
-        say(f"task       {env.name}: {env.num_agents} agents, {env.landmarks} landmarks, {env.max_cycles} steps")
+        say(f"task       {config.task}: {plan.num_agents} agents, episodes of {plan.max_cycles} steps")
         say(f"preset     {config.preset} ({config.algorithm.name}), {plan.parameters:,} parameters")
         say(f"seeds      {seeds} on {', '.join(plan.devices)}")
         say(
@@ -83,6 +75,8 @@ class TerminalWatcher:
         )
         state = readable(plan.bytes_per_seed * config.num_seeds)
         say(f"memory     {state} for the training state; {readable(plan.bytes_needed)} in all, at the least")
+        for note in plan.notes:
+            say(f"note       {note}")
         if self._alive:
             self._live.start()
 
@@ -110,23 +104,31 @@ class TerminalWatcher:
             return
         say = self._print
         if run.summary is None:
-            say(f"stopped at environment step {run.env_steps:,}; go on with: gacrl resume {run.folder}")
+            again = f"gacrl resume {run.folder}{tasks.flag(run.config.task)}"
+            say(f"stopped at environment step {run.env_steps:,}; go on with: {again}")
             return
         print_evaluation({"run": str(run.folder), **run.summary}, self._console)
-        if run.config.algorithm.name == "gacrl_paper" and run.config.env.reward == "paper":
-            self._paper_tables(run)
+        self._paper_tables(run)
         summary = run.summary
         say(
             f"{summary['steps_per_second']:,.0f} training steps/s, {summary['compile_seconds']:.1f} s compiling, "
             f"{summary['wall_seconds']:.1f} s in all"
         )
         say(f"summary    {run.folder / 'summary.json'}")
-        say(f"episodes   {run.folder / 'episodes.gif'}")
+        picture = run.folder / "episodes.gif"
+        if picture.is_file():
+            say(f"episodes   {picture}")
+        else:
+            say(
+                f"episodes   {run.folder / 'episodes'}; no picture: {run.config.task} does not say where things are"
+            )
 
     def _paper_tables(self, run: Run) -> None:
         from gacrl.experiments.paper import tables as paper_tables
 
-        with self._console.status("playing random, noop and oracle at the difficulty of each row"):
+        if not paper_tables.apply_to(run.config):
+            return
+        with self._console.status("playing policies that learn nothing at the difficulty of each row"):
             metrics = RunFolder(run.folder).metrics()
             tables = {
                 paper_tables.printed()[name]["caption"]: rows(run.config, metrics)
@@ -148,7 +150,7 @@ class TerminalWatcher:
                     _cell(row.mean.get(name), row.sd.get(name) if row.sd else None)
                     for name in paper_tables.COLUMNS
                 ]
-                end = row.who == "oracle"
+                end = row.who == paper_tables.SCRIPTED[-1]
                 table.add_row(str(row.episode), row.who, *cells, end_section=end)
             self._console.print(table)
 
@@ -266,31 +268,34 @@ class _Line:
         return Text.assemble(spinning, line) if isinstance(spinning, Text) else line
 
 
+_ON_A_LINE = 3
+"""Metrics of the progress line."""
+
+
 def describe(progress: Progress, episode: int) -> str:
-    """One line on where a run stands; the paper's columns, the mean over this stretch's episodes and seeds."""
+    """One line on where a run stands: what its greedy evaluation reached, the mean over the seeds."""
 
     def mean(name: str) -> str:
-        values = [row["train"]["mean"][name] for row in progress.rows if name in row["train"]["mean"]]
-        return f"{sum(values) / len(values):.2f}" if values else "-"
+        return f"{sum(row['greedy'][name] for row in progress.rows) / len(progress.rows):.2f}"
 
+    reached = "  ".join(f"{label} {mean(name)}" for name, label in list(progress.shown.items())[:_ON_A_LINE])
     return (
-        f"episode {episode:,}  {progress.clock.steps_per_second:,.0f} steps/s  "
-        f"shaped {mean('reward_shaped')}  raw {mean('reward_raw')}  "
-        f"coverage {mean('coverage_mean_theta')} (0.1: {mean('coverage_mean_0.1')})  "
-        f"distance {mean('distance_agent_landmark')}  left {_duration(progress.seconds_left)}"
+        f"episode {episode:,}  {progress.clock.steps_per_second:,.0f} steps/s  {reached}  "
+        f"left {_duration(progress.seconds_left)}"
     )
 
 
 def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> None:
-    """A table of the main metrics: the policy, and random, noop and oracle on the same starts."""
+    """A table of the task's metrics: the policy, and those that learn nothing, on the same starts."""
     console = _console() if console is None else console
+    shown: dict[str, str] = scores["task"]["shown"]
     title = f"{scores['run']}: {scores['episodes']} episodes of {scores['horizon']} steps"
-    if any(metrics["return_agent_mean"]["interval"] for metrics in scores["final"].values()):
+    if any(metrics[next(iter(shown))]["interval"] for metrics in scores["final"].values()):
         title += "; mean over seeds ± half the 95 % interval"
-    table = Table("", *_SHOWN.values(), title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table("", *shown.values(), title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for kind, metrics in scores["final"].items():
         cells: list[str] = []
-        for name in _SHOWN:
+        for name in shown:
             entry = metrics.get(name)
             interval = entry and entry["interval"]
             half_width = (interval[1] - interval[0]) / 2 if interval else None
@@ -298,7 +303,7 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
         table.add_row(kind, *cells)
     table.add_section()
     for who, metrics in scores["references"].items():
-        table.add_row(who, *[_cell(metrics.get(name), None, 3) for name in _SHOWN])
+        table.add_row(who, *[_cell(metrics.get(name), None, 3) for name in shown])
     console.print(table)
     if "messages" in scores:
         bits = scores["messages"]
