@@ -41,24 +41,14 @@ from gacrl.experiments.study import (
 from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
+from gacrl.tasks.task import Part, Task
 from gacrl.training.recorder import RunFolder
 
 FULL, YOKED = "all parts", "yoked-exploration"
-METRICS = ("coverage_final_0.1", "coverage_final_0.2", "return_agent_mean", "collisions")
-SCORE = "coverage_final_0.1"
-"""What a part's worth is judged by."""
 EVALUATIONS = 45
 """Along a training; also the number of levels that a yoked one replays."""
 EPISODES = 8
 """Of each, for the curves: the closing one is what counts, and has the preset's."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """What is taken away, and how."""
-
-    says: str
-    changes: Mapping[str, Any]
 
 
 def _network(**changes: Any) -> Mapping[str, Any]:
@@ -84,12 +74,16 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "plain-play": Part(
             "played in the world as it is, not by the mean over its turns", _algorithm(symmetric_play=False)
         ),
-        "no-coverage-bonus": Part("MPE2's reward alone", {"env": {"reward": "mpe2"}}),
         "one-step": Part("targets of one reward", _algorithm(n_step=1)),
         "no-average": Part("played with the parameters that learn", _algorithm(averaged=False)),
     }
 )
-"""By what is left, as `gacrl ablate --part` names it."""
+"""By what is left, as `gacrl ablate --part` names it; a task may have further ones (`Task.parts`)."""
+
+
+def parts_of(config: RunConfig) -> dict[str, Part]:
+    """All that can be taken away on this task."""
+    return {**PARTS, **tasks.find(config.task).parts}
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,7 @@ class Outcome:
     """Per metric of the closing greedy evaluation [S]; empty for a run that diverged."""
     evaluated_at: tuple[int, ...]
     along: NDArray[np.float64]
-    """The score along training [S, P]."""
+    """The task's headline along training [S, P]."""
     epsilon: NDArray[np.float64]
     """Mean share of random actions in each stretch [S, P]."""
     diverged: str | None = None
@@ -115,10 +109,11 @@ class Ablation:
 
     out: Path
     report: Path
+    task: Task
     outcomes: tuple[Outcome, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"out": str(self.out), "report": str(self.report), **_data(self.outcomes)}
+        return {"out": str(self.out), "report": str(self.report), **_data(self.task, self.outcomes)}
 
 
 def ablate(
@@ -132,8 +127,8 @@ def ablate(
 ) -> Ablation | None:
     """Train what is missing under `out`, write `report.html`, `report.md` and `summary.json` there.
 
-    parts: names in PARTS; none: all. updates: gradient steps after each rollout; none: half of the configured ones,
-    with which `gacrl-112k` covers as much (docs/results.md) in little more than half the time. Returns None where
+    parts: names in `parts_of`; none: all. updates: gradient steps after each rollout; none: half of the configured
+    ones, with which `gacrl-112k` covers as much (docs/results.md) in little more than half the time. Returns None where
     the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
     not GACRL's, or a folder that holds something else.
     """
@@ -142,9 +137,10 @@ def ablate(
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if not isinstance(config.algorithm, GacrlConfig):
         raise UserError(f"--preset {config.preset} has no parts to take away: name a GACRL preset")
+    known = parts_of(config)
     for name in parts:
-        if name not in PARTS:
-            raise UserError(unknown("part", name, list(PARTS)))
+        if name not in known:
+            raise UserError(unknown("part", name, list(known)))
     steps = config.training.env_steps if env_steps is None else env_steps
     configured = config.algorithm.updates
     updates = max(configured // 2, 1) if updates is None else updates
@@ -155,7 +151,7 @@ def ablate(
         training=replace(config.training, env_steps=steps),
         evaluation=replace(config.evaluation, interval=max(steps // EVALUATIONS, 1), num_episodes=EPISODES),
     )
-    runs = plan(config, out, list(dict.fromkeys(parts)) or list(PARTS))
+    runs = plan(config, out, list(dict.fromkeys(parts)) or list(known))
     asked = {"config": configuration.to_dict(config)}
     claim_folder(out, "ablate.json", asked, "ablation", lambda held: "another ablation: choose another --out")
     refuse_other_settings([run for run in runs if run.name != YOKED])  # its settings come from a run
@@ -170,40 +166,40 @@ def ablate(
     if not train_missing(runs[1:], watch):
         return None
     watch.say("writing the report")
-    outcomes = tuple(_outcome(run) for run in runs)
-    done = Ablation(out, _report(out, config, configured, outcomes), outcomes)
-    (out / "summary.json").write_text(json.dumps(_data(outcomes), indent=2) + "\n", encoding="utf-8")
+    task, outcomes = tasks.find(config.task), tuple(_outcome(run) for run in runs)
+    done = Ablation(out, _report(out, config, configured, outcomes), task, outcomes)
+    (out / "summary.json").write_text(json.dumps(_data(task, outcomes), indent=2) + "\n", encoding="utf-8")
     return done
 
 
 def plan(config: RunConfig, out: Path, parts: Sequence[str]) -> list[Planned]:
     """The run with all parts, and one without each; the yoked one lacks the levels, which the first will give."""
-    wanted = _num_parameters(config)
+    wanted, known = _num_parameters(config), parts_of(config)
     runs = [Planned(FULL, config, out / "all-parts")]
     for name in parts:
-        changes = dict(PARTS[name].changes)
+        changes = dict(known[name].changes)
         if "network" in changes.get("algorithm", {}):
             network = {**changes["algorithm"]["network"], "parameters": wanted}
             changes["algorithm"] = {**changes["algorithm"], "network": network}
         if name == YOKED:
-            changes["algorithm"] = {**changes["algorithm"], "yoked_coverage": [0.0]}
+            changes["algorithm"] = {**changes["algorithm"], "yoked_progress": [0.0]}
         runs.append(Planned(name, configuration.from_dict(changes, config), out / name))
     return runs
 
 
 def _yoked(run: Planned, full: Planned) -> Planned:
-    """With the coverage that the full runs' exploration followed, the mean over seeds; read back from its ε."""
+    """With the progress that the full runs' exploration followed, the mean over seeds; read back from its ε."""
     algorithm = full.config.algorithm
     assert isinstance(algorithm, GacrlConfig)
     span = algorithm.epsilon - algorithm.epsilon_end
     missing = np.clip((_outcome(full).epsilon - algorithm.epsilon_end) / (span or 1.0), 0.0, 1.0)
-    coverage = 1.0 - np.sqrt(missing.mean(0))
-    changes = _algorithm(yoked_coverage=[round(float(value), 4) for value in coverage])
+    progress = 1.0 - np.sqrt(missing.mean(0))
+    changes = _algorithm(yoked_progress=[round(float(value), 4) for value in progress])
     return replace(run, config=configuration.from_dict(changes, run.config))
 
 
 def _num_parameters(config: RunConfig) -> int:
-    env = tasks.make(config.env)
+    env = tasks.find(config.task).make(config.env)
     network = config.algorithm.network  # pyright: ignore[reportAttributeAccessIssue] GACRL's, checked
     actions = choices(env).size
     return acting_parameters(env, matched(env, network, actions), actions)
@@ -225,17 +221,21 @@ def _read_outcome(run: Planned) -> Outcome:
     rows = folder.metrics()
     steps = tuple(sorted({row["env_steps"] for row in rows}))
     by_seed = [[row for row in rows if row["seed"] == seed] for seed in run.config.seeds]
+    task = tasks.find(run.config.task)
     return Outcome(
         name=run.name,
         parameters=_num_parameters(run.config),
-        final={metric: np.array(summary["final"]["greedy"][metric]["values"]) for metric in METRICS},
+        final={
+            metric: np.array(summary["final"]["greedy"][metric]["values"])
+            for metric in task.shown(list(summary["final"]["greedy"]))
+        },
         evaluated_at=steps,
-        along=np.array([[row["greedy"][SCORE] for row in seed] for seed in by_seed]),
+        along=np.array([[row["greedy"][task.headline] for row in seed] for seed in by_seed]),
         epsilon=np.array([[row["update"]["epsilon"] for row in seed] for seed in by_seed]),
     )
 
 
-def _data(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def _data(task: Task, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     full = outcomes[0]
     return {
         "runs": [
@@ -245,7 +245,9 @@ def _data(outcomes: Sequence[Outcome]) -> dict[str, Any]:
                 "diverged": outcome.diverged,
                 "final": {metric: values.tolist() for metric, values in outcome.final.items()},
                 "intervals": {metric: list(estimate(values)) for metric, values in outcome.final.items()},
-                "probability_that_the_part_helps": _worth(full, outcome),
+                "probability_that_the_part_helps": (
+                    None if outcome is full else {m: _worth(task, m, full, outcome) for m in full.final}
+                ),
                 "env_steps": list(outcome.evaluated_at),
                 "along": outcome.along.tolist(),
                 "epsilon": outcome.epsilon.tolist(),
@@ -255,50 +257,35 @@ def _data(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def _worth(full: Outcome, without: Outcome) -> Estimate | None:
-    """P(a seed with all parts scores higher than one without this), and its interval."""
+def _worth(task: Task, metric: str, full: Outcome, without: Outcome) -> Estimate | None:
+    """P(a seed with all parts does better in this metric than one without this part), and its interval."""
     if without is full or not full.final or not without.final:
         return None
-    return probability_of_improvement(full.final[SCORE], without.final[SCORE])
+    sign = 1.0 if task.metric(metric).higher_is_better else -1.0
+    return probability_of_improvement(sign * full.final[metric], sign * without.final[metric])
 
 
 def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome]) -> Path:
     """configured: gradient steps after each rollout, as they were before the ablation chose its own."""
-    page = Page("What each part of GACRL is worth")
+    page, task = Page("What each part of GACRL is worth"), tasks.find(config.task)
+    horizon = task.make(config.env).max_cycles
     page.text(
-        f"{config.preset}, {config.training.env_steps:,} environment steps in episodes of {config.env.max_cycles}, "
+        f"{config.preset} on {task.name}, {config.training.env_steps:,} environment steps in episodes of {horizon}, "
         f"{_updates(config)} gradient steps after every {config.steps_per_update} (the preset has "
         f"{configured}), {config.num_seeds} seeds from {config.seed}; closing "
-        f"evaluation: {config.evaluation.final_episodes} fixed episodes, greedy, last parameters, MPE2's own reward. "
-        "Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part of the "
+        f"evaluation: {config.evaluation.final_episodes} fixed episodes, greedy, last parameters, the task's own "
+        "return. Interquartile mean over seeds and its 95 % stratified-bootstrap interval. Where a part of the "
         "acting network is off, the rest is wider, so that it has about as many parameters; the central critic, which "
         "does not act, is left out of that count."
     )
-    rows: list[list[str]] = []
-    for outcome in outcomes:
-        says = PARTS[outcome.name].says if outcome.name in PARTS else "nothing taken away"
-        if outcome.diverged is not None:
-            cells = [f"diverged: {outcome.diverged}", *[""] * (len(METRICS) + 1)]
-        else:
-            worth = _worth(outcomes[0], outcome)
-            cells = [with_interval(estimate(values)) for values in outcome.final.values()]
-            if worth is None:
-                cells += ["", ""]
-            else:
-                cells += [with_interval(worth, ".2f"), _detectable(outcomes[0], outcome)]
-        rows.append([outcome.name, says, f"{outcome.parameters:,}", *cells])
-    page.table(("", "what it is", "parameters", *METRICS, "P(the part helps)", "detectable"), rows)
-    page.text(
-        f"P(the part helps): the probability that a seed with all parts ends with a higher {SCORE} than one without "
-        "it. It is claimed where it is .95 or more and its interval lies above .5; fewer than 10 seeds indicate. "
-        f"Detectable: the smallest difference of mean {SCORE} that so many seeds would show in 80 % of all repetitions."
-    )
+    _results(page, task, config, outcomes)
+    _worths(page, task, outcomes)
     ended = [outcome for outcome in outcomes if outcome.diverged is None]
     page.figure(
         figures.dots(
-            {outcome.name: outcome.final[SCORE] for outcome in ended},
-            {outcome.name: estimate(outcome.final[SCORE]) for outcome in ended},
-            SCORE,
+            {outcome.name: outcome.final[task.headline] for outcome in ended},
+            {outcome.name: estimate(outcome.final[task.headline]) for outcome in ended},
+            task.headline,
         ),
         "Every seed is a dot, below them the interquartile mean and its 95 % interval.",
         "parts",
@@ -306,16 +293,16 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
     page.heading("Along training")
     page.figure(
         figures.curves(
-            {o.name: _series(o, sample_efficiency(o.along)) for o in ended}, "environment steps", SCORE
+            {o.name: _series(o, sample_efficiency(o.along)) for o in ended}, "environment steps", task.headline
         ),
-        f"{SCORE} of {config.evaluation.num_episodes} greedy episodes: interquartile mean, 95 % interval.",
+        f"{task.headline} of {config.evaluation.num_episodes} greedy episodes: interquartile mean, 95 % interval.",
         "curves",
     )
     exploring = [o for o in ended if o.name == FULL or "exploration" in o.name]
     page.heading("Exploration")
     page.text(
-        "How much is explored against what greedy play covers, in the same stretch of training: with the feedback "
-        "the level falls when the coverage rises, and not before."
+        "How much is explored against what greedy play reaches, in the same stretch of training: with the feedback "
+        "the level falls when that rises, and not before."
     )
     page.figure(
         figures.curves(
@@ -328,18 +315,46 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
     )
     page.figure(
         figures.curves(
-            {o.name: _against_coverage(o) for o in exploring}, f"{SCORE}, greedy, mean over seeds", "ε"
+            {o.name: _against_headline(o) for o in exploring}, f"{task.headline}, greedy, mean over seeds", "ε"
         ),
-        "The level of exploration against coverage: mean over seeds at each evaluation, ordered by coverage.",
-        "level-against-coverage",
+        f"The level of exploration against {task.headline}: mean over seeds at each evaluation, ordered by the latter.",
+        "level-against-headline",
     )
     page.heading("How this was made")
     page.code(_command(config, outcomes))
     return page.write(out, "report")
 
 
-def _detectable(full: Outcome, without: Outcome) -> str:
-    return f"{detectable(full.final[SCORE], without.final[SCORE]):.3f}"
+def _results(page: Page, task: Task, config: RunConfig, outcomes: Sequence[Outcome]) -> None:
+    """What each of the runs reached."""
+    rows: list[list[str]] = []
+    for outcome in outcomes:
+        known = parts_of(config)
+        says = known[outcome.name].says if outcome.name in known else "nothing taken away"
+        if outcome.diverged is not None:
+            cells = [f"diverged: {outcome.diverged}", *[""] * (len(outcomes[0].final) - 1)]
+        else:
+            cells = [with_interval(estimate(values)) for values in outcome.final.values()]
+        rows.append([outcome.name, says, f"{outcome.parameters:,}", *cells])
+    page.table(("", "what it is", "parameters", *outcomes[0].final), rows)
+
+
+def _worths(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
+    """What each part is worth, by every metric."""
+    rows: list[list[str]] = []
+    for outcome in outcomes[1:]:
+        worths = [_worth(task, metric, outcomes[0], outcome) for metric in outcomes[0].final]
+        if None not in worths:
+            cells = [with_interval(worth, ".2f") for worth in worths if worth is not None]
+            apart = detectable(outcomes[0].final[task.headline], outcome.final[task.headline])
+            rows.append([outcome.name, *cells, f"{apart:.3f}"])
+    page.heading("The probability that a part helps")
+    page.table(("without", *outcomes[0].final, f"detectable {task.headline}"), rows)
+    page.text(
+        "The probability that a seed with all parts ends with a better value than one without this one. It is claimed "
+        "where it is .95 or more and its interval lies above .5; fewer than 10 seeds indicate. Detectable: the "
+        f"smallest difference of mean {task.headline} that so many seeds would show in 80 % of all repetitions."
+    )
 
 
 def _updates(config: RunConfig) -> int:
@@ -351,15 +366,16 @@ def _series(outcome: Outcome, curve: Curve) -> figures.Series:
     return outcome.evaluated_at, curve.point, curve.low, curve.high, None
 
 
-def _against_coverage(outcome: Outcome) -> figures.Series:
-    coverage, level = outcome.along.mean(0), outcome.epsilon.mean(0)
-    order = np.argsort(coverage, kind="stable")
-    return coverage[order], level[order], None, None, None
+def _against_headline(outcome: Outcome) -> figures.Series:
+    reached, level = outcome.along.mean(0), outcome.epsilon.mean(0)
+    order = np.argsort(reached, kind="stable")
+    return reached[order], level[order], None, None, None
 
 
 def _command(config: RunConfig, outcomes: Sequence[Outcome]) -> str:
     words = ["gacrl ablate", f"--preset {config.preset}", f"--seeds {config.num_seeds}", f"--seed {config.seed}"]
     words += [f"--env-steps {config.training.env_steps}", f"--updates {_updates(config)}"]
-    if len(outcomes) <= len(PARTS):
+    words += [tasks.flag(config.task).strip()] if tasks.flag(config.task) else []
+    if len(outcomes) <= len(parts_of(config)):
         words += [f"--part {outcome.name}" for outcome in outcomes[1:]]
     return " ".join(words)

@@ -1,122 +1,159 @@
 """Measuring and recording whatever `RUN` names: a run folder, one member of it, or a scripted policy."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
 from gacrl import tasks
 from gacrl.adapters import mpe2
-from gacrl.config.algorithms import LearningConfig
-from gacrl.config.run import EnvConfig
+from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation import episodes as recording
+from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import stream_key
-from gacrl.evaluation.references import play_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.messages.bits import bits_used
+from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun, open_run
-from gacrl.tasks.spread import scripted
-from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.task import Task
 from gacrl.types import Memory, Policy
 
 Warn = Callable[[str], None]
+Change = Callable[[Any], Any]
+"""The settings of a task -> those to play in."""
+Backend = Literal["jax", "mpe2"]
 
 _HEARD = 32
 """Episodes in which the symbols are counted."""
 
 
+def unchanged(settings: Any) -> Any:
+    """The task as it was trained."""
+    return settings
+
+
 @dataclass(frozen=True)
-class Changes:
-    """What to alter about the task that a run was trained in; None leaves it."""
+class Played:
+    """A task as it is played."""
 
-    horizon: int | None = None
-    num_agents: int | None = None
-    arena_scale: float | None = None
+    task: Task
+    settings: Any
 
-    def apply(self, env: EnvConfig) -> EnvConfig:
-        """The altered task. Raises ConfigError for what cannot be."""
-        changed = {"max_cycles": self.horizon, "num_agents": self.num_agents, "arena_scale": self.arena_scale}
-        return replace(env, **{name: value for name, value in changed.items() if value is not None})
+    @property
+    def env(self) -> Environment:
+        """Its environment."""
+        return self.task.make(self.settings)
 
 
 def score_run(
     run: str,
     episodes: int,
-    changes: Changes | None = None,
-    backend: Literal["jax", "mpe2"] = "jax",
+    change: Change = unchanged,
+    backend: Backend = "jax",
     warn: Warn = lambda sentence: None,
+    task: str = tasks.DEFAULT,
 ) -> dict[str, Any]:
     """The metrics of a policy, greedy and sampled, with those of the scripted policies on the same starts.
 
-    Returns {run, backend, episodes, horizon, num_agents, final: {greedy, sampled}, references} as in
-    `summary.json`, and messages where agents send symbols. MPE2 draws its own starts: there, the scripted policies
-    play those.
+    task: in which a scripted policy plays. Returns {run, backend, episodes, horizon, num_agents, task, final: {greedy,
+    sampled}, references} as in `summary.json`, and messages where agents send symbols. MPE2 draws its own starts:
+    there, the scripted policies play those.
     """
-    changes = changes or Changes()
     messages = None
-    if run in scripted.PLAYABLE:
-        env = tasks.make(changes.apply(EnvConfig()))
-        references = _references(env, episodes, backend)
-        metrics = references.get(run) or _scripted(run, env, episodes, backend)
+    scripted = _scripted_task(run, task, change)
+    if scripted is not None:
+        played = scripted
+        beside = _references(played, episodes, backend)
+        metrics = beside.get(run) or _play_scripted(run, played, episodes, backend)
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
-        opened = open_run(run, changes.apply, warn)
-        env = opened.env
-        references = _references(env, episodes, backend)
+        opened = open_run(run, change, warn)
+        played = Played(opened.task, opened.config.env)
+        beside = _references(played, episodes, backend)
         final = {
             kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
             for kind in ("greedy", "sampled")
         }
         messages = _messages(opened)
+    facts = played.task.facts(played.settings, list(final["greedy"]))
     return {
         "run": run,
         "backend": backend,
         "episodes": episodes,
-        "horizon": env.max_cycles,
-        "num_agents": env.num_agents,
-        "final": {kind: normalised(metrics, references) for kind, metrics in final.items()},
-        "references": references,
+        "horizon": played.env.max_cycles,
+        "num_agents": played.env.num_agents,
+        "task": facts,
+        "final": {kind: normalised(metrics, beside, facts["scale"]) for kind, metrics in final.items()},
+        "references": beside,
         **({} if messages is None else {"messages": messages}),
     }
 
 
+def _scripted_task(run: str, task: str, change: Change) -> Played | None:
+    """The task that a scripted policy of this name plays; None for a run."""
+    found = tasks.find(task)
+    if run not in references.playable(found):
+        return None
+    return Played(found, change(tasks.default_settings(task)))
+
+
 def _messages(opened: TrainedRun) -> dict[str, float] | None:
     """Bits that an agent of the first member sends in a step of greedy play, and how many a good code would need."""
-    config = opened.config.algorithm
-    if not isinstance(config, LearningConfig) or config.network.communication != "discrete":
+    config, env = opened.config.algorithm, opened.env
+    network = getattr(config, "network", None)
+    if network is None or not kind_of(network).sends_symbols:
         return None
-    env, policy = opened.env, opened.policy(0, False)
-    key = stream_key("report")
-    heard = recording.record_many(env, policy, opened.trainer.memory, env.default_params(), key, _HEARD)
+    heard = _record(opened.policy(0, False), opened.trainer.memory, env, opened.trainer.evaluation_params, _HEARD)
     conversations = env.num_symmetries if config.symmetric_play else 1
-    sent = conversations * config.network.rounds * float(np.log2(config.network.vocabulary))
+    sent = conversations * network.rounds * float(np.log2(network.vocabulary))
     used = bits_used(heard)
     return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
+
+
+class Recorded(NamedTuple):
+    """Episodes of a policy to look at, and the task that they are of."""
+
+    episodes: list[recording.Episode]
+    task: Task
 
 
 def record_run(
     run: str,
     episodes: int,
-    changes: Changes | None = None,
+    change: Change = unchanged,
     sampled: bool = False,
     warn: Warn = lambda sentence: None,
-) -> list[recording.Episode]:
+    task: str = tasks.DEFAULT,
+) -> Recorded:
     """Episodes of a policy, to look at: the first of those that `score_run` measures."""
-    changes = changes or Changes()
-    policy: Policy
-    memory: Memory
-    if run in scripted.PLAYABLE:
-        env = tasks.make(changes.apply(EnvConfig()))
-        policy, memory = scripted.make(run, env)
+    played = _scripted_task(run, task, change)
+    if played is not None:
+        actor = references.actor(played.task, run, played.env)
+        policy, memory, env = actor.policy, actor.initial_memory, played.env
+        params = played.task.numbers(played.settings, env)
     else:
-        opened = open_run(run, changes.apply, warn)
-        env, policy, memory = opened.env, opened.policy(0, sampled), opened.trainer.memory
-    return recording.record_many(env, policy, memory, env.default_params(), stream_key("report"), episodes)
+        opened = open_run(run, change, warn)
+        played = Played(opened.task, opened.config.env)
+        policy, memory, env = opened.policy(0, sampled), opened.trainer.memory, opened.env
+        params = opened.trainer.evaluation_params
+    look = references.look_of(played.task, played.settings)
+    return Recorded(_record(policy, memory, env, params, episodes, look), played.task)
 
 
-def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: str) -> dict[str, np.ndarray]:
+def _record(
+    policy: Policy,
+    memory: Memory,
+    env: Environment,
+    params: EnvParams,
+    episodes: int,
+    look: recording.Look | None = None,
+) -> list[recording.Episode]:
+    return recording.record_many(env, policy, memory, params, stream_key("report"), episodes, look=look)
+
+
+def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: Backend) -> dict[str, np.ndarray]:
     """Each metric's mean over the episodes, one number per member [S]."""
     members = opened.config.num_seeds
     if backend == "jax":
@@ -129,13 +166,13 @@ def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: str) -> 
     return {name: np.array([metrics[name].mean() for metrics in played]) for name in played[0]}
 
 
-def _references(env: Spread, episodes: int, backend: str) -> dict[str, dict[str, float]]:
-    return {name: _scripted(name, env, episodes, backend) for name in scripted.SCRIPTED}
+def _references(played: Played, episodes: int, backend: Backend) -> dict[str, dict[str, float]]:
+    return {name: _play_scripted(name, played, episodes, backend) for name in references.shown(played.task)}
 
 
-def _scripted(name: str, env: Spread, episodes: int, backend: str) -> dict[str, float]:
+def _play_scripted(name: str, played: Played, episodes: int, backend: Backend) -> dict[str, float]:
     if backend == "jax":
-        return play_scripted(name, env, episodes)
-    policy, memory = scripted.make(name, env)
-    metrics = mpe2.evaluate(env, policy, memory, stream_key("report"), episodes)
+        return references.play_scripted(name, played.task.name, played.settings, episodes)
+    policy, memory = references.actor(played.task, name, played.env)
+    metrics = mpe2.evaluate(played.env, policy, memory, stream_key("report"), episodes)
     return {metric: float(values.mean()) for metric, values in metrics.items()}

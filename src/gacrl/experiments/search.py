@@ -16,12 +16,13 @@ from typing import Any, Literal
 
 from scipy.stats import qmc
 
+from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
-from gacrl.evaluation.metrics import EPISODE_METRICS
+from gacrl.evaluation.metrics import measures_of, table_of
 from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing, why_diverged
 from gacrl.report.page import Page
 from gacrl.training.recorder import RunFolder
@@ -111,8 +112,10 @@ class Search:
         }
 
 
-def load(path: Path) -> Spec:
-    """Read a search from a TOML file (docs/guides/cluster.md). Raises UserError with one sentence."""
+def load(path: Path, task: str | None = None) -> Spec:
+    """Read a search from a TOML file (docs/guides/cluster.md).
+
+    task: which it is about, in place of the preset's. Raises UserError with one sentence."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -120,12 +123,12 @@ def load(path: Path) -> Spec:
     except ValueError as error:
         raise UserError(f"{path} is not TOML: {error}") from error
     try:
-        return _spec(data)
+        return _spec(data, task)
     except ConfigError as error:
         raise UserError(f"{path}: {error}") from error
 
 
-def _spec(data: Mapping[str, Any]) -> Spec:
+def _spec(data: Mapping[str, Any], task: str | None) -> Spec:
     for key in data:
         if key not in _KEYS:
             raise ConfigError(unknown("key", key, list(_KEYS)))
@@ -137,19 +140,27 @@ def _spec(data: Mapping[str, Any]) -> Spec:
         raise ConfigError(f"direction must be 'maximize' or 'minimize', not {direction!r}")
     if not isinstance(trials, int) or not 1 <= trials <= 100_000:
         raise ConfigError(f"trials must be a whole number between 1 and 100000, not {trials!r}")
-    config = _base(data)
+    config = _base(data, task)
     ranges = _flat(data["search"], "")
     if not ranges:
         raise ConfigError(
             "[search] is empty: name a setting and its range, as algorithm.learning_rate = {log = [1e-4, 1e-2]}"
         )
     searched = tuple(_searched(setting, given, config) for setting, given in ranges.items())
-    if data["metric"] not in EPISODE_METRICS:
-        raise ConfigError(unknown("metric", str(data["metric"]), list(EPISODE_METRICS)))
+    metrics = _metrics(config)
+    if data["metric"] not in metrics:
+        raise ConfigError(unknown("metric", str(data["metric"]), metrics))
     return Spec(config, searched, data["metric"], direction == "maximize", trials)
 
 
-def _base(data: Mapping[str, Any]) -> RunConfig:
+def _metrics(config: RunConfig) -> list[str]:
+    """What an evaluation of this task holds."""
+    task = tasks.find(config.task)
+    env = task.make(config.env)
+    return list(table_of(measures_of(env, task.numbers(config.env, env)), task.metrics).names)
+
+
+def _base(data: Mapping[str, Any], task: str | None) -> RunConfig:
     """The settings that all trials share."""
     fixed = data.get("fixed", {})
     if not isinstance(fixed, Mapping):
@@ -158,7 +169,9 @@ def _base(data: Mapping[str, Any]) -> RunConfig:
     for key, setting in (("seeds", "num_seeds"), ("seed", "seed")):
         if key in data:
             changes[setting] = data[key]
-    config = configuration.from_dict({**changes, **fixed})  # pyright: ignore[reportUnknownArgumentType]
+    named = presets.preset(str(changes["preset"]))
+    base = named if task is None else configuration.on_task(named, task)
+    config = configuration.from_dict({**changes, **fixed}, base)  # pyright: ignore[reportUnknownArgumentType]
     if "env_steps" in data:
         return configuration.from_dict({"training": {"env_steps": data["env_steps"]}}, config)
     return config
@@ -304,7 +317,8 @@ def conclude(spec: Spec, out: Path) -> Search:
     if ranked and ranked[0].state == "finished":
         config = replace(spec.settings_of(ranked[0].values), preset=spec.config.preset)
         (out / "best.json").write_text(configuration.dumps(config), encoding="utf-8")
-        page.code(f"gacrl train --config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}")
+        again = f"--config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}{tasks.flag(spec.config.task)}"
+        page.code(f"gacrl train {again}")
     page.write(out, "report")
     done = Search(out, out / "report.html", ranked)
     (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")

@@ -35,17 +35,14 @@ from gacrl.experiments.compare.finished import (
     values_along,
 )
 
-METRICS = ("return_agent_mean", "coverage_final_0.1")
-"""What is compared unless something is asked for."""
-LOWER_IS_BETTER = ("distance_agent_landmark", "distance_landmark_agent", "collisions", "near_agents")
+SHOWN = 2
+"""Metrics that are compared unless some are asked for: the first of those that the task has in its tables."""
 INDICATIVE = 10
 """Fewer seeds than this indicate, and do not claim."""
 TOO_FEW = 5
 """Fewer than this, and the interval of a bootstrap is much too narrow for a verdict."""
 
 _SWITCHES = (
-    *("env.reward", "env.max_cycles", "env.local_ratio", "env.num_agent_neighbors", "env.num_landmark_neighbors"),
-    *("env.coverage_bonus", "env.continuous_actions"),
     *("algorithm.network.torso", "algorithm.network.recurrent", "algorithm.network.communication"),
     *(
         "algorithm.augment",
@@ -139,7 +136,9 @@ class Comparison:
     groups: tuple[Group, ...]
     pairs: tuple[Pair, ...]
     references: Mapping[str, Mapping[str, float]]
-    """What random, noop and oracle get in the same task."""
+    """What policies that learn nothing get in the same task."""
+    facts: Mapping[str, Any]
+    """What must be known of the task (`Task.facts`)."""
     episodes: int
     horizon: int
     config_differences: Mapping[str, tuple[Any, ...]]
@@ -148,8 +147,12 @@ class Comparison:
     """What a reader must know before believing it, a sentence each."""
 
     def reference(self, who: str, metric: str) -> float:
-        """What random, noop or oracle gets; of a score, on its scale from random to oracle."""
-        return on_scale(self.references[who], self.references, metric)
+        """What one of those gets; of a score, on its scale."""
+        return on_scale(self.references[who], self.references, metric, self.facts["scale"])
+
+    def lower_is_better(self, metric: str) -> bool:
+        """Whether less of it is more."""
+        return metric in self.facts["lower_is_better"]
 
     @property
     def unequal_switches(self) -> tuple[str, ...]:
@@ -159,16 +162,17 @@ class Comparison:
 
 def compare(
     runs: Sequence[Path],
-    metrics: Sequence[str] = METRICS,
+    metrics: Sequence[str] = (),
     play: Play = "greedy",
     warn: Warn = lambda sentence: None,
     margin: float | None = None,
 ) -> Comparison:
     """Read run folders and compare them.
 
-    metrics: names as in `summary.json`. margin: in the units of the metric, of which there must then be one; groups are
-    tested for differing by less. Raises UserError for a run that is damaged or has not ended, for runs
-    of different tasks, and for a metric that there is not or that is not a number somewhere.
+    metrics: names as in `summary.json`; none: what the task has first in its tables. margin: in the units of the
+    metric, of which there must then be one; groups are tested for differing by less. Raises UserError for a run that is
+    damaged or has not ended, for runs of different tasks, and for a metric that there is not or that is not a number
+    somewhere.
     """
     if not runs:
         raise UserError("name at least one run folder: `gacrl compare RUN RUN`")
@@ -178,6 +182,8 @@ def compare(
         statistics.require_margin(margin)
     loaded = [load(path, warn) for path in runs]
     require_same_task(loaded)
+    facts = loaded[0].facts
+    metrics = tuple(metrics) or tuple(facts["shown"])[:SHOWN]
     for metric in metrics:
         known = sorted(set.intersection(*(set(run.summary["final"][play]) for run in loaded)))
         if metric not in known:
@@ -191,8 +197,13 @@ def compare(
         play=play,
         metrics=tuple(metrics),
         groups=groups,
-        pairs=tuple(_pair(a, b, metric, margin) for metric in metrics for a, b in combinations(groups, 2)),
+        pairs=tuple(
+            _pair(a, b, metric, margin, metric in facts["lower_is_better"])
+            for metric in metrics
+            for a, b in combinations(groups, 2)
+        ),
         references=first["references"],
+        facts=facts,
         episodes=first["episodes"],
         horizon=first["horizon"],
         config_differences=differences,
@@ -271,12 +282,12 @@ def _group(name: str, members: Sequence[Finished], metrics: Sequence[str], play:
     )
 
 
-def _pair(a: Group, b: Group, metric: str, margin: float | None) -> Pair:
+def _pair(a: Group, b: Group, metric: str, margin: float | None, lower_is_better: bool) -> Pair:
     first, second = a.final[metric], b.final[metric]
     point = a.point(metric) - b.point(metric)
     if min(len(first), len(second)) < 2:
         return Pair(a.name, b.name, metric, point, None, None, 1)
-    sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
+    sign = -1.0 if lower_is_better else 1.0
     better = statistics.probability_of_improvement(sign * first, sign * second)
     difference = statistics.difference(first, second)
     equivalence = None if margin is None else statistics.equivalent(first, second, margin)
@@ -291,7 +302,7 @@ def _differences(groups: Sequence[Group]) -> dict[str, tuple[Any, ...]]:
 
 
 def _is_switch(name: str, values: Sequence[Any]) -> bool:
-    if name.startswith("curriculum."):
+    if name.startswith(("curriculum.", "env.")):
         return True
     return name in _SWITCHES and len({_show(_WITHOUT.get(name, v) if v == _ABSENT else v) for v in values}) > 1
 

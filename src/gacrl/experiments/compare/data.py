@@ -47,12 +47,13 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
 
 def to_marl_eval(comparison: Comparison) -> dict[str, Any]:
     """The runs as marl-eval's raw data: a mean over the episodes of each evaluation."""
-    env = comparison.groups[0].config.env
-    task = f"{env.num_agents}_agents_{comparison.horizon}_steps"
+    config = comparison.groups[0].config
+    agents = getattr(config.env, "num_agents", None)
+    task = f"{comparison.horizon}_steps" if agents is None else f"{agents}_agents_{comparison.horizon}_steps"
     return marl_eval.to_marl_eval(
         [
             marl_eval.EvaluatedRun(
-                environment=env.name,
+                environment=config.task,
                 task=task,
                 algorithm=group.name,
                 run=f"seed_{seed}",

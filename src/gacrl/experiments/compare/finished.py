@@ -1,8 +1,7 @@
 """A run that has ended, as its files tell it, and whether it may stand beside another.
 
-Every run reports its return in one convention (MPE2's reward at its default local ratio, the mean over agents, summed
-over the episode), whatever it learned from, so that there is nothing to convert; returns of other horizons have no
-exact conversion, and are refused.
+Every run of a task reports its return in one convention, whatever it learned from, so that there is nothing to convert;
+returns over different horizons cannot be compared, and are refused.
 """
 
 import json
@@ -11,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
+from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
@@ -18,20 +18,6 @@ from gacrl.training.recorder import RunFolder
 
 Play = Literal["greedy", "sampled"]
 Warn = Callable[[str], None]
-
-_TASK = (
-    *("env.name", "env.num_agents", "env.num_landmarks", "env.arena_scale", "env.landmark_speed"),
-    *("env.terminate_on_success", "env.reset_on_collision", "env.reset_distance"),
-)
-"""Settings that make another task, in which every number means something else."""
-_MEASURED_WITH = {
-    "reward_shaped": (
-        *("env.local_ratio", "env.coverage_threshold"),
-        *("env.collision_term", "env.collision_distance"),
-    ),
-    "coverage_mean_theta": ("env.coverage_threshold",),
-}
-"""Metrics that are defined by settings."""
 
 
 class Finished(NamedTuple):
@@ -42,6 +28,8 @@ class Finished(NamedTuple):
     settings: dict[str, Any]
     """The same under dotted names."""
     summary: dict[str, Any]
+    facts: dict[str, Any]
+    """What must be known of its task (`Task.facts`)."""
     rows: list[dict[str, Any]]
     """Of `metrics.jsonl`: an evaluation of a seed each."""
 
@@ -77,7 +65,13 @@ def load(path: Path, warn: Warn) -> Finished:
         raise UserError(f"{folder.summary_file} is damaged: {error}") from error
     if lines > len(rows):
         warn(f"the last line of {folder.metrics_file}, line {lines}, is cut off: compared without it")
-    return Finished(path, config, flat(configuration.to_dict(config)), summary, rows)
+    facts = summary.get("task") or _former_facts(config, list(summary["final"]["greedy"]))
+    return Finished(path, config, flat(configuration.to_dict(config)), summary, facts, rows)
+
+
+def _former_facts(config: RunConfig, measured: Sequence[str]) -> dict[str, Any]:
+    """Of a run of version 0.1.0, whose summary does not have them; and as a file would have them."""
+    return json.loads(json.dumps(tasks.find(config.task).facts(config.env, measured)))
 
 
 def require_same_task(runs: Sequence[Finished]) -> None:
@@ -88,13 +82,18 @@ def require_same_task(runs: Sequence[Finished]) -> None:
         if horizons[0] != horizons[1]:
             raise UserError(
                 f"{first.path} was evaluated over {horizons[0]} steps, {run.path} over {horizons[1]}, and returns "
-                "of one are not to be had from the other: train with the same --evaluation.horizon"
+                "over different horizons cannot be compared: train with the same --evaluation.horizon"
             )
-        for name in _TASK:
-            ours, theirs = _task_setting(first, name), _task_setting(run, name)
+        names = [run.facts.get("name") for run in (first, run)]
+        if names[0] != names[1]:
+            raise UserError(
+                f"{first.path} and {run.path} are different tasks, {names[0]} and {names[1]}: compare runs of one task"
+            )
+        for name, ours in first.facts["comparable"].items():
+            theirs = run.facts["comparable"].get(name)
             if ours != theirs:
                 raise UserError(
-                    f"{first.path} and {run.path} are different tasks, {name} is {ours} in one and {theirs} in "
+                    f"{first.path} and {run.path} are different tasks, env.{name} is {ours} in one and {theirs} in "
                     "the other: compare runs of one task"
                 )
         versions = [r.summary.get("versions", {}).get("mpe2") for r in (first, run)]
@@ -105,18 +104,10 @@ def require_same_task(runs: Sequence[Finished]) -> None:
             )
 
 
-def _task_setting(run: Finished, name: str) -> Any:
-    env = run.config.env
-    if name == "env.num_landmarks":
-        return env.landmarks  # as many as agents, or said so
-    if name == "env.reset_distance" and env.reset_on_collision == "off":
-        return None
-    return run.settings[name]
-
-
 def require_same_meaning(runs: Sequence[Finished], metric: str) -> None:
     """Raises UserError for a metric that settings define, where these differ."""
-    for name in _MEASURED_WITH.get(metric.removeprefix("score_"), ()):
+    for setting in runs[0].facts["defined_by"].get(metric.removeprefix("score_"), ()):
+        name = f"env.{setting}"
         for run in runs[1:]:
             ours, theirs = runs[0].settings[name], run.settings[name]
             if ours != theirs:
@@ -153,7 +144,8 @@ def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -
         try:
             if row["seed"] != seed:
                 continue
-            values = {metric: on_scale(row[play], run.summary["references"], metric) for metric in metrics}
+            references, scale = run.summary["references"], run.facts["scale"]
+            values = {metric: on_scale(row[play], references, metric, scale) for metric in metrics}
             found[int(row["env_steps"])] = values
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{where} is not an evaluation with {play} {', '.join(metrics)}") from error
@@ -163,12 +155,14 @@ def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -
     return found
 
 
-def on_scale(values: Mapping[str, Any], references: Mapping[str, Any], metric: str) -> float:
-    """A metric among those of an evaluation; a score is made there, from what random and oracle got."""
-    if metric in values or not metric.startswith("score_"):
+def on_scale(
+    values: Mapping[str, Any], references: Mapping[str, Any], metric: str, scale: Sequence[str] | None
+) -> float:
+    """A metric among those of an evaluation; a score is made there, from the two references that are 0 and 1."""
+    if metric in values or not metric.startswith("score_") or scale is None:
         return float(values[metric])
     name = metric.removeprefix("score_")
-    low, high = float(references["random"][name]), float(references["oracle"][name])
+    low, high = (float(references[who][name]) for who in scale)
     return (float(values[name]) - low) / (high - low)
 
 

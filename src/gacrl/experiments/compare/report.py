@@ -10,9 +10,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from gacrl import tasks
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import with_interval
-from gacrl.experiments.compare.compare import LOWER_IS_BETTER, Comparison, Group, Pair
+from gacrl.experiments.compare.compare import Comparison, Group, Pair
 
 PAGE = "comparison"
 """The page's name in its folder."""
@@ -66,7 +67,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
     for metric in comparison.metrics:
         page.heading(metric)
         lines = {who: comparison.reference(who, metric) for who in comparison.references}
-        better = ", lower is better" if metric in LOWER_IS_BETTER else ""
+        better = ", lower is better" if comparison.lower_is_better(metric) else ""
         name = metric.replace(".", "-")
         series = {group.name: _series(group, metric) for group in comparison.groups if group.evaluated_at}
         if series:
@@ -94,7 +95,8 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
             f"{name}-profile",
         )
     page.heading("Runs")
-    page.code("gacrl compare " + " ".join(run for group in comparison.groups for run in group.runs))
+    runs = " ".join(run for group in comparison.groups for run in group.runs)
+    page.code(f"gacrl compare {runs}{tasks.flag(comparison.groups[0].config.task)}")
     return page.write(folder, PAGE)
 
 

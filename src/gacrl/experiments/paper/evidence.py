@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gacrl.config.run import RunConfig
-from gacrl.experiments.paper.tables import reference_episodes
+from gacrl.experiments.paper.tables import SCRIPTED, reference_episodes
 from gacrl.experiments.study import reading, why_diverged
-from gacrl.tasks.spread.scripted import SCRIPTED
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]

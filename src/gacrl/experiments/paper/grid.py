@@ -217,7 +217,7 @@ def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[
     filled = [*group, *[group[-1]] * (trainer.num_seeds - len(group))]
     states = [trainer.init_member(stream_key("training", seed), _hyper(trainer, point)) for point, seed in filled]
     state = shard_seeds(stack_seeds(states), trainer.mesh)
-    place = trainer.metric_names.index(SCORE)
+    place = trainer.table.names.index(SCORE)
     total, ended = np.zeros(len(group)), np.zeros(len(group))
     updates = -(-grid.episodes * grid.config.env.max_cycles // grid.config.steps_per_update)
     stretch = min(_STRETCH * grid.config.env.max_cycles // grid.config.steps_per_update, updates)
@@ -228,7 +228,8 @@ def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[
         ended += episodes.ended[: len(group)]
         say(f"  episode {int(ended[0])}: shaped reward so far {np.mean(total / np.maximum(ended, 1)):.2f}")
     numbers = range(len(filled))
-    diverged = {number for number, _, _ in not_finite(numbers, [{}] * len(filled), state.learner)}
+    replay = trainer.algorithm.replay(state.learner)
+    diverged = {number for number, _, _ in not_finite(numbers, [{}] * len(filled), state.learner, replay)}
     return [
         -math.inf if number in diverged else float(total[number] / ended[number]) for number in range(len(group))
     ]

@@ -18,8 +18,8 @@ from gacrl.experiments.paper import report_tables as reproduce_tables
 from gacrl.experiments.paper.claims import Judged, untrained
 from gacrl.experiments.paper.evidence import COLUMNS, Evidence
 from gacrl.experiments.paper.report_tables import interquartile
+from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.report.page import Page
-from gacrl.tasks.spread.scripted import SCRIPTED
 
 _INDICATIVE = 10
 

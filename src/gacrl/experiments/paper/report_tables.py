@@ -8,18 +8,17 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.config.run import EnvConfig
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import estimate, sample_efficiency, with_interval
 from gacrl.experiments.paper import tables as paper_tables
 from gacrl.experiments.paper.claims import Measure, Reading, claims, measures
 from gacrl.experiments.paper.evidence import COLUMNS, FINAL_EPISODES, Evidence, MissingRun, Play, measured
+from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.paper.verdicts import ROUNDING, best_of_random, random_interval
 from gacrl.report import figures
 from gacrl.report.page import Page
-from gacrl.tasks.spread.scripted import SCRIPTED
+from gacrl.tasks.spread.environment import Spread
 
 SHOWN = ("shaped", "raw", "distance", "coverage_0.1", "coverage_theta", "near", "agents")
 """The measures of the tables."""
@@ -277,7 +276,7 @@ def environment_svg() -> str:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    state, _ = tasks.make(EnvConfig()).reset(stream_key("report"))
+    state, _ = Spread().reset(stream_key("report"))
     agents, landmarks = jax.device_get((state.positions, state.landmarks))
     figure = Figure(figsize=(4.2, 4.2))
     axes = figure.add_subplot(aspect="equal", xlim=(-1.25, 1.25), ylim=(-1.25, 1.25))

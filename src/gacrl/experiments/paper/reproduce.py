@@ -12,13 +12,14 @@ from typing import Any, Literal
 
 from gacrl.config import files as configuration
 from gacrl.config import presets
-from gacrl.config.run import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig
+from gacrl.config.run import EvaluationConfig, RunConfig
 from gacrl.errors import UserError
 from gacrl.experiments.paper import evidence
 from gacrl.experiments.paper import report as reproduce_report
 from gacrl.experiments.paper.claims import Judged
 from gacrl.experiments.paper.verdicts import judge_all
 from gacrl.experiments.study import Planned, Watch, claim_folder, refuse_other_settings, train_missing
+from gacrl.tasks.spread.settings import SpreadSettings
 
 Column = Literal["paper", "mpe2", "extended"]
 
@@ -41,7 +42,7 @@ _AT_PAPER_BUDGET: Mapping[str, dict[str, Any]] = MappingProxyType(
         "ippo": _PPO,
         "qmix": {
             "training": {"num_envs": 5, "num_steps": 15},
-            "algorithm": {"updates": 10, "epsilon_steps": 30_000, "network": {"width": 64}},
+            "algorithm": {"updates": 10, "exploration_steps": 30_000, "network": {"width": 64}},
         },
     }
 )
@@ -69,8 +70,7 @@ def at_paper_budget(preset: str) -> RunConfig:
     config = configuration.from_dict(_AT_PAPER_BUDGET[preset], presets.preset(preset))
     return replace(
         config,
-        env=EnvConfig(max_cycles=HORIZON),
-        curriculum=CurriculumConfig(),
+        env=SpreadSettings(max_cycles=HORIZON),
         training=replace(config.training, env_steps=EPISODES * HORIZON),
         evaluation=EvaluationConfig(interval=50 * HORIZON, num_episodes=8),
     )
@@ -80,8 +80,7 @@ def in_column(config: RunConfig, column: Column) -> RunConfig:
     """The same with the column's reward: the paper's, and its curriculum; or MPE2's on an unchanging task."""
     if column != "paper":
         return config
-    paper = presets.preset("paper")
-    return replace(config, env=replace(config.env, reward=paper.env.reward), curriculum=paper.curriculum)
+    return replace(config, env=presets.preset("paper").env)
 
 
 def plan(

@@ -19,8 +19,9 @@ from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import scripted_program
-from gacrl.tasks.spread import scripted
 
+SCRIPTED = ("random", "noop", "oracle")
+"""Who plays the same task beside the paper and us."""
 COLUMNS = {
     "reward_shaped": "Sh. Reward",
     "reward_raw": "Raw Rew.",
@@ -49,6 +50,11 @@ def printed() -> dict[str, Any]:
     return json.loads(
         resources.files("gacrl.experiments.paper").joinpath("paper.json").read_text(encoding="utf-8")
     )
+
+
+def apply_to(config: RunConfig) -> bool:
+    """Whether a run is the paper's algorithm on the paper's reward."""
+    return config.algorithm.name == "gacrl_paper" and getattr(config.env, "reward", None) == "paper"
 
 
 def table_2(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
@@ -105,7 +111,7 @@ def _paper_columns(table: str, numbers: list[float]) -> dict[str, float]:
 def _references(config: RunConfig, episode: int, task: Mapping[str, float]) -> list[Row]:
     """What random, noop and oracle get at the difficulty of that episode, over many episodes."""
     rows: list[Row] = []
-    for name in scripted.SCRIPTED:
+    for name in SCRIPTED:
         metrics = reference_episodes(name, config, task)
         mean = {metric: float(values.mean()) for metric, values in metrics.items()}
         sd = {metric: float(values.std()) for metric, values in metrics.items()}
@@ -119,8 +125,9 @@ def reference_episodes(name: str, config: RunConfig, task: Mapping[str, float]) 
 
 
 def _play_scripted(name: str, config: RunConfig, local_ratio: float, threshold: float) -> dict[str, np.ndarray]:
-    env = tasks.make(config.env)
-    params = env.default_params()._replace(
+    task = tasks.find(config.task)
+    params = task.numbers(config.env, task.make(config.env))._replace(
         local_ratio=jnp.asarray(local_ratio), coverage_threshold=jnp.asarray(threshold)
     )
-    return jax.device_get(scripted_program(name, env, REFERENCE_EPISODES)(params, stream_key("report")))
+    program = scripted_program(name, config.task, config.env, REFERENCE_EPISODES)
+    return jax.device_get(program(params, stream_key("report")))

@@ -195,7 +195,7 @@ def possible(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     for episode, row in table["rows"].items():
         raw, coverage = row[table["columns"].index("reward_raw")], row[table["columns"].index("coverage")]
         progress = min(int(episode) / curriculum.curriculum.episodes, 1.0)
-        start, end = curriculum.env.coverage_threshold, curriculum.curriculum.coverage_threshold_end or 0.0
+        start, end = curriculum.env.coverage_threshold, curriculum.env.coverage_threshold_end or 0.0
         radius = start + progress * (end - start) if within_theta else 0.1
         most = -(1 - ratio) * agents * (1 - coverage - ROUNDING) * radius
         if raw - ROUNDING > most:
