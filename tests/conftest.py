@@ -53,6 +53,21 @@ def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
         yield environment
 
 
+@pytest.fixture
+def from_outside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test brings from outside (tasks, messages, exploration rules, algorithms) is gone after it."""
+    from gacrl import tasks
+    from gacrl.config import algorithms, kinds
+
+    monkeypatch.setattr(tasks, "_OWN", {})
+    registries: tuple[dict[str, Any], ...] = (kinds.COMMUNICATION, kinds.EXPLORATION, algorithms.ALGORITHMS)
+    before = [dict(registry) for registry in registries]
+    yield
+    for registry, kept in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(kept)
+
+
 def drawn(build: Any, *settings: Any, seed: int = 0) -> Any:
     """`build(*settings, key)`, a network, with numbers drawn by NumPy: nothing is compiled to make one.
 

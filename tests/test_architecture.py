@@ -3,22 +3,25 @@
 import ast
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import gacrl
+from gacrl.tasks.spread.settings import SpreadSettings
 
 PACKAGE = Path(gacrl.__file__).parent
 
 LAYERS = (
-    ("errors", "types", "versions", "config", "evaluation.statistics"),
-    ("cli.arguments", "envs", "networks", "report"),
-    ("tasks",),
+    ("errors", "types", "versions", "config", "tasks", "tasks.spread.settings", "evaluation.statistics"),
+    ("cli.arguments", "envs", "networks", "report", "scene"),
+    ("tasks.own", "tasks.spread"),
     ("algorithms",),
     ("rollout",),
     ("evaluation",),
@@ -126,6 +129,77 @@ def test_a_backward_import_is_seen(source: str, found: list[str]):
 def test_an_unknown_room_is_seen():
     with pytest.raises(KeyError, match="cellar"):
         backward_imports("cli", "from gacrl.cellar import wine")
+
+
+def words_of(source: str) -> set[str]:
+    """Every name and every text of a file, except its docstrings."""
+    tree = ast.parse(source)
+    said = {
+        node.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    }
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value not in said:
+            found |= set(re.findall(r"\w+", node.value))
+        for field in ("id", "attr", "arg", "name", "module"):
+            name = getattr(node, field, None)
+            found |= set(name.split(".")) if isinstance(name, str) else set()
+    return found
+
+
+KNOWS_SPREAD = (
+    "tasks",
+    "adapters/mpe2",
+    "algorithms/gacrl_paper",
+    "experiments/paper",
+    "config/presets",
+    "config/run",
+)
+"""What may: the task itself, MPE2 and the paper, which are about it, the presets, and who takes it where none is named."""
+SPREADS_OWN = {
+    "Spread",
+    "SpreadSettings",
+    "SpreadParams",
+    "SpreadState",
+    "oracle",
+    "near_agents",
+    "collisions",
+} | {
+    field.name
+    for field in fields(SpreadSettings)
+    if field.name not in ("num_agents", "max_cycles", "continuous_actions", "reward")
+}
+
+
+def test_nobody_but_a_task_knows_its_names():
+    """No setting, parameter or metric of spread stands outside `tasks`; what one line of a preset is about aside."""
+    known = {
+        str(path.relative_to(PACKAGE)): sorted(
+            word
+            for word in words_of(path.read_text(encoding="utf-8"))
+            if word in SPREADS_OWN or word.startswith("coverage_")
+        )
+        for path in MODULES
+        if not str(path.relative_to(PACKAGE)).startswith(KNOWS_SPREAD)
+    }
+    allowed = {
+        "cli/main.py": ["oracle"],  # an example in its help
+        "config/algorithms.py": ["coverage_signal"],  # the paper's
+        "config/former.py": ["coverage_radius"],  # of version 0.1.0
+        "doctor.py": ["oracle"],  # here and in MPE2
+    }
+    assert {name: words for name, words in known.items() if words} == allowed
+
+
+def test_settings_of_tasks_are_leaves():
+    """Help shows them without loading JAX."""
+    for path in (PACKAGE / "tasks").rglob("settings.py"):
+        imported = {room_of(name) for _, name in modules_imported(path.read_text(encoding="utf-8"))}
+        assert imported <= {"errors", "config", "tasks"}, path
 
 
 def test_the_command_line_starts_without_jax():

@@ -24,18 +24,20 @@ def commands(text: str) -> list[list[str]]:
     text = re.sub(r" *\\\n *", " ", text)  # a line that goes on
     found = re.findall(r"`gacrl ([^`]+)`|^ *gacrl ([^#\n]+)", text, flags=re.MULTILINE)
     lines = (re.split(r"  | > ", inline or line)[0] for inline, line in found)
-    return [words for words in map(shlex.split, lines) if words and not PLACEHOLDERS & set(words)]
+    whole = (line for line in lines if not PLACEHOLDERS & set(re.findall(r"\w+", line)))
+    return [words for words in map(shlex.split, whole) if words]
 
 
 @pytest.fixture
-def only_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    parse = arguments.parse
+def only_parsed(from_outside: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = arguments._parsed
 
     def stop(*given: Any, **named: Any) -> None:
         parse(*given, **named)
         raise Understood
 
-    monkeypatch.setattr(arguments, "parse", stop)
+    monkeypatch.setattr(arguments, "_parsed", stop)
+    monkeypatch.chdir(ROOT)  # the examples are named from there
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -72,3 +74,15 @@ def test_every_setting_that_the_documents_name_exists():
     for page in PAGES:
         unknown = set(re.findall(pattern, page.read_text(encoding="utf-8"))) - known
         assert not {name for name in unknown if not name.startswith("training.devices")}, page.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_modules_that_the_documents_name_exist(page: Path):
+    """As a path from one of the folders or as a tail of one; what an older house had is in the log."""
+    here = {
+        str(path.relative_to(ROOT))
+        for folder in ("src", "tests", "benchmarks", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    for named in set(re.findall(r"[`( ]([\w/]+\.py)\b", page.read_text(encoding="utf-8"))) - {"FILE.py"}:
+        assert page.name == "log.md" or any(f"/{path}".endswith(f"/{named}") for path in here), named

@@ -125,7 +125,7 @@ def test_a_member_is_named_by_its_number(run: Path, policy: gacrl.LoadedPolicy, 
 def test_a_changed_task_keeps_the_parameters(run: Path):
     opened = play.open_run(run, lambda env: replace(env, max_cycles=7, arena_scale=2.0))
     assert opened.env.max_cycles == 7
-    assert opened.env.initial_params.arena_scale == 2.0
+    assert opened.trainer.evaluation_params.arena_scale == 2.0
     with pytest.raises(gacrl.UserError, match="trained with 3 agents"):
         play.open_run(run, lambda env: replace(env, num_agents=4))
 
@@ -165,7 +165,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path):
 
 def test_an_environment_is_made_by_its_settings():
     env = gacrl.make_env("spread", num_agents=5, num_landmark_neighbors=2)
-    assert (env.num_agents, env.num_landmarks, env.observation_size) == (5, 5, 4 + 2 * 2 + 4 * 4)
+    assert (env.num_agents, env.landmarks, env.observation_size) == (5, 5, 4 + 2 * 2 + 4 * 4)
     state, seen = jax.eval_shape(env.reset, jax.random.key(0))
     assert seen.features.shape == (5, env.observation_size)
     _, after = jax.eval_shape(env.step, state, jnp.zeros(5, jnp.int32), jax.random.key(0))

@@ -1,6 +1,8 @@
 """Pictures: everything is in them, where and in the colour that it should be, for any size of team."""
 
 import itertools
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +10,10 @@ from PIL import Image, ImageColor
 
 from gacrl import render
 from gacrl.evaluation.episodes import Episode
+from gacrl.scene import PLAIN, Discs, Scene
+from gacrl.tasks.task import Words
+
+SPREAD = Words(mark="landmark", lit="covered")
 
 VISION = {
     "usual": np.eye(3),
@@ -18,29 +24,66 @@ VISION = {
 }
 
 
-def world(positions, landmarks, steps=3, symbols=None, hears=None, **changes) -> Episode:
-    """An episode in which nothing moves, unless there are rows for every step."""
+def discs(positions: np.ndarray, radius: float, there: Any, lit: Any = False) -> Discs:
+    """Things of one radius that are there, and lit, for all the time or as rows of moments say."""
+    shape = positions.shape[:2]
+    return Discs(
+        positions=positions,
+        radius=np.full(shape, radius),
+        there=np.broadcast_to(there, shape),
+        lit=np.broadcast_to(lit, shape),
+        colour=np.full(shape, PLAIN),
+    )
+
+
+def world(
+    positions,
+    landmarks,
+    steps=3,
+    symbols=None,
+    hears=None,
+    agent_mask=True,
+    landmark_mask=True,
+    **changes,
+) -> Episode:
+    """An episode of spread in which nothing moves, unless there are rows for every step."""
     positions, landmarks = (np.asarray(rows, float) for rows in (positions, landmarks))
     positions, landmarks = (
         np.repeat(rows[None], steps + 1, axis=0) if rows.ndim == 2 else rows for rows in (positions, landmarks)
     )
     agents = positions.shape[1]
     messages = None if symbols is None else np.eye(64)[np.repeat([symbols], steps, axis=0)]
+    seen = discs(positions, 0.15, agent_mask)
+    near = np.linalg.norm(positions[:, :, None] - landmarks[:, None], axis=-1) < 0.1
     values = {
-        "positions": positions,
-        "landmarks": landmarks,
+        "scene": Scene(
+            agents=seen,
+            marks=discs(landmarks, 0.1, landmark_mask, (near & seen.there[..., None]).any(1)),
+            lines=np.zeros((steps + 1, 0, 2, 2)),
+            ground=np.tile([[-1.0, -1.0], [1.0, 1.0]], (steps + 1, 1, 1)),
+        ),
         "actions": np.zeros((steps, agents), int),
         "reward": np.zeros((steps, agents)),
         "reward_raw": np.full(steps, -1.5),
-        "agent_mask": np.ones(agents, bool),
-        "landmark_mask": np.ones(landmarks.shape[1], bool),
-        "agent_radius": 0.15,
-        "capture_radius": 0.1,
-        "arena_scale": 1.0,
+        "agent_mask": seen.there[:-1],
         "messages": messages,
         "adjacency": None if hears is None else np.repeat(np.asarray(hears, bool)[None], steps, axis=0),
     }
     return Episode(**(values | changes))
+
+
+def scene_of(episode: Episode) -> Scene:
+    assert episode.scene is not None
+    return episode.scene
+
+
+def redrawn(episode: Episode, agents: dict[str, Any] | None = None, **changes: Any) -> Episode:
+    """The same episode with another look: of its agents, its marks or the rest of its scene."""
+    look = scene_of(episode)
+    marks = look.marks._replace(**changes.pop("marks", {}))
+    return replace(
+        episode, scene=look._replace(agents=look.agents._replace(**agents or {}), marks=marks, **changes)
+    )
 
 
 def scene(picture: Image.Image) -> np.ndarray:
@@ -71,7 +114,7 @@ def walk(seed: int, agents: int = 3, steps: int = 25) -> Episode:
 def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_path):
     episodes = [world([[0, 0]], [[0.5, 0.5]], steps=3, symbols=[1]), walk(0, steps=5)]
     path = tmp_path / "two.gif"
-    render.gif(episodes, path, size=240, fps=20, title="Two")
+    render.gif(episodes, path, size=240, fps=20, title="Two", words=SPREAD)
     assert [file.name for file in tmp_path.iterdir()] == ["two.gif"]
     with Image.open(path) as film:
         assert film.n_frames == 4 + 6
@@ -81,7 +124,7 @@ def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_pat
         for k, (episode, t) in enumerate(shown):
             film.seek(k)
             durations.append(film.info["duration"])
-            expected = render.frame(episode, t, 240, "Two")
+            expected = render.frame(episode, t, 240, "Two", SPREAD)
             assert film.size == expected.size
             seen = np.asarray(film.convert("RGB"))[20:].astype(int)  # "episode 1 of 2" stands above
             error = np.abs(seen - np.asarray(expected)[20:]).max(-1)
@@ -92,7 +135,7 @@ def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_pat
 
 def test_four_usual_episodes_make_a_small_file(tmp_path):
     path = tmp_path / "four.gif"
-    render.gif([walk(seed) for seed in range(4)], path)
+    render.gif([walk(seed) for seed in range(4)], path, words=SPREAD)
     assert 100_000 < path.stat().st_size < 800_000
 
 
@@ -170,7 +213,7 @@ def test_who_hears_whom_is_a_line_and_an_arrow_where_only_one_does():
 
 
 def test_padding_is_not_drawn_and_a_new_placement_leaves_no_trail():
-    masks = {"agent_mask": np.array([True, False]), "landmark_mask": np.array([False, True])}
+    masks: dict[str, Any] = {"agent_mask": [True, False], "landmark_mask": [False, True]}
     padded = world([[0.5, 0.5], [0, 0]], [[0, 0], [-0.5, 0]], **masks)
     alone = world([[0.5, 0.5]], [[-0.5, 0]])
     np.testing.assert_array_equal(scene(render.frame(padded, 2)), scene(render.frame(alone, 2)))
@@ -184,6 +227,153 @@ def test_padding_is_not_drawn_and_a_new_placement_leaves_no_trail():
 
     assert change([(-0.8, 0), (0.8, 0)]) == 0
     assert change([(-0.8, 0), (-0.4, 0), (0, 0), (0.4, 0), (0.8, 0)]) > 400
+
+
+def test_who_is_not_there_yet_is_not_drawn_and_leaves_no_trail():
+    """The second agent joins at the third moment of five: until then the picture is that of the first alone."""
+    path = np.stack([np.linspace(-0.8, 0.8, 5), np.zeros(5)], axis=1)
+    positions = np.stack([np.tile([0.0, -0.8], (5, 1)), path], axis=1)
+    joins = [[True, False]] * 2 + [[True, True]] * 3
+    joining, there = (world(positions, [[0, 0.9]], 4, agent_mask=mask) for mask in (joins, True))
+    alone = world(positions[:, :1], [[0, 0.9]], 4)
+    for t in (0, 1):
+        np.testing.assert_array_equal(scene(render.frame(joining, t)), scene(render.frame(alone, t)))
+        assert (scene(render.frame(there, t)) != scene(render.frame(alone, t))).any()
+    # At its first moment there is the agent and no way that it came; later the way from there on.
+    still = world(np.stack([positions[:, 0], np.tile(path[2], (5, 1))], axis=1), [[0, 0.9]], 4)
+    np.testing.assert_array_equal(scene(render.frame(joining, 2)), scene(render.frame(still, 2)))
+    last, whole = (scene(render.frame(episode, 4))[238:242] for episode in (joining, there))
+    columns = np.flatnonzero((last != whole).any((0, 2)))
+    assert columns.min() > 240 - 0.8 * 221 - 3 and columns.max() < 240 + 3, "the first half of the way is missing"
+    assert len(columns) > 100
+
+
+def test_who_has_left_is_not_drawn_and_says_nothing():
+    """Of two speakers the second leaves with the last step; its words do not stay behind."""
+    places = [[-0.5, 0.0], [0.5, 0.0]]
+    leaving = world(places, [[0, 0.9]], 3, [1, 2], agent_mask=[[True, True]] * 3 + [[True, False]])
+    staying = world(places, [[0, 0.9]], 3, [1, 2])
+    for t in range(3):
+        np.testing.assert_array_equal(scene(render.frame(leaving, t)), scene(render.frame(staying, t)))
+    assert len(where(scene(render.frame(leaving, 3)), render.SYMBOL_COLOURS[1])) > 100
+    assert len(where(scene(render.frame(leaving, 3)), render.SYMBOL_COLOURS[2])) == 0
+    assert len(where(scene(render.frame(staying, 3)), render.SYMBOL_COLOURS[2])) > 100
+    alone = world(places[:1], [[0, 0.9]], 3, [1])
+    np.testing.assert_array_equal(scene(render.frame(leaving, 3)), scene(render.frame(alone, 3)))
+
+
+def test_no_line_leads_to_who_has_left():
+    """The graph of the last step stays with the last words, but for those who are no longer there."""
+    places, both = [[-0.5, 0.0], [0.5, 0.0]], [[0, 1], [1, 0]]
+    leaving = world(places, [[0, 0.9]], hears=both, agent_mask=[[True, True]] * 3 + [[True, False]])
+    staying = world(places, [[0, 0.9]], hears=both)
+    np.testing.assert_array_equal(scene(render.frame(leaving, 2)), scene(render.frame(staying, 2)))
+    np.testing.assert_array_equal(
+        scene(render.frame(leaving, 3)), scene(render.frame(world(places[:1], [[0, 0.9]]), 3))
+    )
+
+
+def test_marks_are_counted_where_they_are_there_and_lit():
+    """What the footer says changes with what is lit, and not with what is not there."""
+    marks, agents = [[0.9, 0.9], [0.9, -0.9], [-0.9, 0.9]], [[0.0, 0.0]]
+
+    def footer(lit: list[bool], there: list[bool]) -> np.ndarray:
+        episode = redrawn(
+            world(agents, marks), marks={"lit": np.tile(lit, (4, 1)), "there": np.tile(there, (4, 1))}
+        )
+        return np.asarray(render.frame(episode, 1))[-92:-40]
+
+    two_of_three = footer([True, True, False], [True] * 3)
+    assert (two_of_three != footer([True, False, False], [True] * 3)).any()
+    np.testing.assert_array_equal(two_of_three, footer([False, True, True], [True] * 3))
+    one_of_two = footer([True, False, True], [True, True, False])
+    np.testing.assert_array_equal(one_of_two, footer([True, False, True], [False, True, True]))
+    assert (one_of_two != two_of_three).any()
+
+
+def test_things_are_called_what_the_task_calls_them():
+    """In title, captions and legend, and nowhere else; an agent and a mark of their own name."""
+    episode = world([[0, 0], [0.5, 0.5]], [[0.5, -0.5]])
+    usual, spread = (np.asarray(render.frame(episode, 1, words=words)) for words in (Words(), SPREAD))
+    np.testing.assert_array_equal(usual[38:518], spread[38:518])
+    assert (usual[:38] != spread[:38]).any() and (usual[518:] != spread[518:]).any()
+    cars = np.asarray(render.frame(episode, 1, words=replace_words(agent="car")))
+    assert (usual[:38] != cars[:38]).any() and (usual[-40:] != cars[-40:]).any()
+    np.testing.assert_array_equal(usual[518:570], cars[518:570])
+    named = np.asarray(render.frame(episode, 1, title="Two of them", words=replace_words(agent="car")))
+    np.testing.assert_array_equal(named[:38], np.asarray(render.frame(episode, 1, title="Two of them"))[:38])
+
+
+def replace_words(**words: str) -> Words:
+    return Words()._replace(**words)
+
+
+def test_without_marks_nothing_is_said_of_them():
+    """Neither in the title, nor in the footer, nor in the legend: whatever they would be called."""
+    bare = world([[0, 0]], np.zeros((4, 0, 2)))
+    first, second = (np.asarray(render.frame(bare, 1, words=words)) for words in (Words(), SPREAD))
+    np.testing.assert_array_equal(first, second)
+    hidden = world([[0, 0]], [[0.5, 0.5]], landmark_mask=False)
+    np.testing.assert_array_equal(np.asarray(render.frame(hidden, 1)), first)
+
+
+def test_colours_of_agents_and_marks_are_those_of_the_symbols():
+    """A rim, or a cross in a ring; the ninth begins again, and what has no colour has none of them."""
+    plain = world([[-0.5, 0.0]], [[0.5, 0.0]])
+    colour = render.SYMBOL_COLOURS[2]
+    assert len(where(scene(render.frame(plain, 1)), colour)) == 0
+    agent = redrawn(plain, agents={"colour": np.full((4, 1), 2)})
+    found = where(scene(render.frame(agent, 1)), colour)
+    assert len(found) > 100 and (found[:, 1] < 240).all()
+    np.testing.assert_allclose(np.ptp(found, axis=0), 2 * 0.15 * 220.8, atol=4)
+    mark = redrawn(plain, marks={"colour": np.full((4, 1), 2)})
+    found = where(scene(render.frame(mark, 1)), colour)
+    assert len(found) > 60 and (found[:, 1] > 240).all()
+    np.testing.assert_allclose(np.ptp(found, axis=0), 2 * 0.1 * 220.8, atol=6)
+    again = redrawn(plain, agents={"colour": np.full((4, 1), 10)})
+    np.testing.assert_array_equal(scene(render.frame(again, 1)), scene(render.frame(agent, 1)))
+    # A lit mark of a colour shows both.
+    lit = redrawn(mark, marks={"lit": np.ones((4, 1), bool)})
+    values = scene(render.frame(lit, 1))
+    assert len(where(values, colour, 40)) > 40 and len(where(values, render.COVERED)) > 40
+
+
+def test_an_agent_that_is_lit_has_a_rim_of_alarm():
+    plain = world([[-0.5, 0.0], [0.5, 0.0]], [[0.0, 0.9]])
+    alarm = redrawn(plain, agents={"lit": np.array([[False, False]] * 2 + [[False, True]] * 2)})
+    for t in (0, 1):
+        np.testing.assert_array_equal(scene(render.frame(alarm, t)), scene(render.frame(plain, t)))
+    for t in (2, 3):
+        found = where(scene(render.frame(alarm, t)), "#c0392b")
+        assert len(found) > 100 and (found[:, 1] > 240).all()
+
+
+def test_roads_lie_where_they_are_said_to_and_are_wholly_in_the_picture():
+    lines = np.tile([[[-0.5, 0.5], [0.5, 0.5]]], (4, 1, 1, 1)).astype(float)
+    plain = world([[0.0, -0.5]], [[0.0, -0.9]])
+    road = redrawn(plain, lines=lines)
+    found = np.argwhere((scene(render.frame(road, 1)) != scene(render.frame(plain, 1))).any(-1))
+    np.testing.assert_allclose(found[:, 0].mean(), 240 - 0.5 * 220.8, atol=2)
+    np.testing.assert_allclose(found[:, 1].min(), 240 - 0.5 * 220.8, atol=3)
+    np.testing.assert_allclose(found[:, 1].max(), 240 + 0.5 * 220.8, atol=3)
+    far = redrawn(plain, lines=lines * [8.0, 1.0])
+    values = scene(render.frame(far, 1))
+    road_rows = np.flatnonzero((values == ImageColor.getrgb("#d5dae0")).all(-1).sum(1) > 300)
+    assert len(road_rows) > 0
+    columns = np.flatnonzero((values[road_rows[0]] == ImageColor.getrgb("#d5dae0")).all(-1))
+    assert 4 < columns.min() < 40 and 440 < columns.max() < 476
+
+
+def test_without_a_ground_the_picture_is_of_what_there_is():
+    """Everything is start area then: the picture holds the agents and marks, however small they are."""
+    far = world([[100.0, 100.0], [101.0, 100.0]], [[100.5, 100.5]])
+    bare = redrawn(far, ground=np.zeros((4, 2, 2)))
+    picture = scene(render.frame(bare, 1))
+    assert (picture[:3] == 255).all() and (picture[:, :3] == 255).all()
+    rims = where(picture, "#3f566e", 40)
+    assert np.ptp(rims[:, 1]) > 400, "from one disc's edge to the other's"
+    ground = scene(render.frame(far, 1))  # a square of 2 far away, and all in between
+    assert np.ptp(where(ground, "#3f566e", 60)[:, 1]) < 40
 
 
 def test_what_cannot_be_drawn_or_written(tmp_path):
@@ -201,4 +391,10 @@ def test_what_cannot_be_drawn_or_written(tmp_path):
         render.gif([], tmp_path / "film.gif")
     with pytest.raises(ValueError, match="the frames 0 to 3, not 4"):
         render.frame(episode, 4)
+    unseen = replace(episode, scene=None)
+    with pytest.raises(ValueError, match="the episode has no scene: there is nothing to draw"):
+        render.frame(unseen, 0)
+    with pytest.raises(ValueError, match="the episode has no scene"):
+        render.gif([episode, unseen], tmp_path / "film.gif")
+    assert [file.name for file in tmp_path.iterdir()] == ["folder.gif"]
     assert render.frame(episode, 0, 120, "long\n" * 99).size[0] == 120

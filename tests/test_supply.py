@@ -79,9 +79,10 @@ def test_a_poisoned_run_runs_nothing(
     (run / "config.json").write_text(json.dumps(settings))
     for command in ("resume", "evaluate", "render"):
         assert main([command, str(run)]) == 2
-        assert "env.name must be one of spread, not 'task.py:Task'" in capsys.readouterr().err
+        assert "is of the task 'task.py:Task', which is not at hand" in capsys.readouterr().err
 
-    np.savez(run / "0.npz", positions=np.array([Payload(proof)], object))
+    arrays = dict.fromkeys(("reward", "reward_raw", "agent_mask"), np.zeros(1))
+    np.savez(run / "0.npz", **arrays, actions=np.array([Payload(proof)], object))
     with pytest.raises(ValueError, match="is not a recorded episode: .*allow_pickle"):
         Episode.load(run / "0.npz")
     assert not proof.exists()

@@ -13,6 +13,7 @@ from gacrl.algorithms.contract import Algorithm
 from gacrl.config import presets
 from gacrl.config.algorithms import LearningConfig, NetworkConfig
 from gacrl.config.run import TrainingConfig
+from gacrl.envs.probes import Probe
 from gacrl.errors import ConfigError
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Channel
@@ -75,5 +76,11 @@ def test_it_is_the_mean_over_eight_conversations():
 def test_networks_that_do_not_go_with_their_learner_are_refused():
     with pytest.raises(ConfigError, match="latent needs a learner that trains the code"):
         replace(presets.preset("mappo").algorithm, network=NetworkConfig(latent="vae"))
-    with pytest.raises(ConfigError, match="symmetric_play needs a network without memory"):
-        replace(presets.preset("gacrl").algorithm, symmetric_play=True, network=NetworkConfig(recurrent=True))
+    gacrl, mappo = (presets.preset(name).algorithm for name in ("gacrl", "mappo"))
+    for network in (NetworkConfig(recurrent=True), NetworkConfig(communication="dial")):
+        for config in (gacrl, mappo):
+            remembering = replace(config, symmetric_play=True, network=network)
+            with pytest.raises(ConfigError, match="symmetric_play needs a network without memory"):
+                algorithms.make(remembering, Spread(), TRAINING)
+            # A task without symmetries is played as it is.
+            algorithms.make(remembering, Probe(), TRAINING)

@@ -1,4 +1,4 @@
-"""GACRL: the team's value, execution without a centre, exploration that follows coverage, pushes for actions."""
+"""GACRL: the team's value, execution without a centre, pushes for actions."""
 
 from dataclasses import replace
 
@@ -11,7 +11,6 @@ from conftest import drawn
 from gacrl.algorithms import build as algorithms
 from gacrl.algorithms import gacrl
 from gacrl.algorithms.actions import STRENGTHS, choices
-from gacrl.algorithms.exploration import EXPLORING, GREEDY, UNSETTLED, Follower, adaptive
 from gacrl.algorithms.q_learning import Network
 from gacrl.config import presets
 from gacrl.config.algorithms import NetworkConfig
@@ -22,7 +21,7 @@ from gacrl.networks.messages import most_likely_symbol
 from gacrl.tasks.spread.environment import Spread
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
-from gacrl.types import Channel, Decision, Transition
+from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -95,46 +94,6 @@ def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():
             after.append(hidden[i] + jax.nn.relu(merged))
         source = hidden = after
     np.testing.assert_allclose(network.head(jnp.concatenate(hidden)), together.head, rtol=1e-4, atol=1e-5)
-
-
-def test_exploration_follows_what_greedy_episodes_cover():
-    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2", memory=0.5)
-    assert rule.level(Follower(jnp.zeros(())), jnp.asarray(0)) == (1.0, 2.0)
-    np.testing.assert_allclose(rule.level(Follower(jnp.asarray(0.5)), jnp.asarray(9)), (0.325, 0.875))
-    np.testing.assert_allclose(rule.level(Follower(jnp.asarray(1.0)), jnp.asarray(0)), (0.1, 0.5), rtol=1e-6)
-
-    # Two of the three environments end; only the first played greedily.
-    steps = Transition(
-        observation=None,  # pyright: ignore[reportArgumentType] not looked at
-        decision=Decision(jnp.zeros((1, 3, 1), int), extras={"mode": jnp.array([[GREEDY, EXPLORING, GREEDY]])}),
-        reward=jnp.zeros((1, 3, 1)),
-        terminated=jnp.zeros((1, 3), bool),
-        truncated=jnp.array([[True, True, False]]),
-        first=jnp.zeros((1, 3), bool),
-        next_observation=None,  # pyright: ignore[reportArgumentType]
-        info={"coverage_0.2": jnp.array([[0.8, 0.2, 0.4]])},
-    )
-    np.testing.assert_allclose(rule.follow(Follower(jnp.asarray(0.2)), steps).coverage, 0.2 + 0.5 * 0.6)
-    unmeasured = steps._replace(info={})
-    assert rule.follow(Follower(jnp.asarray(0.2)), unmeasured).coverage == jnp.float32(0.2)
-
-
-def test_a_yoked_level_replays_another_coverage():
-    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2", recorded=(0.0, 0.5, 1.0), planned_steps=300)
-    learned_well = Follower(jnp.asarray(0.9))
-    for steps, epsilon in ((0, 1.0), (99, 1.0), (100, 0.325), (299, 0.1), (900, 0.1)):
-        level = rule.level(learned_well, jnp.asarray(steps))
-        np.testing.assert_allclose(level.epsilon, epsilon, rtol=1e-6)
-
-
-def test_an_episode_is_settled_once():
-    rule = adaptive((1.0, 0.1), (2.0, 0.5), 0.25, "coverage_0.2")
-    keys = jax.random.split(jax.random.key(0), 4_000)
-    modes, epsilons = jax.vmap(lambda key: rule.begin(jnp.asarray(UNSETTLED), key, jnp.asarray(0.6)))(keys)
-    assert abs((modes == GREEDY).mean() - 0.25) < 0.03
-    np.testing.assert_allclose(epsilons, jnp.where(modes == GREEDY, 0.0, 0.6))
-    again, _ = jax.vmap(lambda key, mode: rule.begin(mode, key, jnp.asarray(0.6)))(keys[::-1], modes)
-    np.testing.assert_array_equal(again, modes)
 
 
 @pytest.mark.parametrize("continuous", [pytest.param(False, marks=pytest.mark.soak), True])

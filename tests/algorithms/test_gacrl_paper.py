@@ -16,8 +16,10 @@ from gacrl.algorithms.gacrl_paper_exploration import Coverage
 from gacrl.config import presets
 from gacrl.config.algorithms import GacrlPaperConfig
 from gacrl.config.run import CurriculumConfig
+from gacrl.errors import ConfigError
 from gacrl.networks.layers import num_parameters
 from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.spread.task import TASK
 from gacrl.training import curriculum
 from gacrl.types import Channel, Rollout, Transition
 
@@ -257,8 +259,8 @@ def test_preset_is_table_one():
     assert (algorithm.epsilon_bonus, algorithm.temperature_bonus) == (0.2, 0.5)
     assert (algorithm.critic_weight, algorithm.kl_weight, algorithm.batch_size) == (0.1, 0.05, 64)
     assert (algorithm.encoder_hidden, algorithm.message_hidden) == ((64, 32), 32)
-    assert (preset.env.coverage_threshold, preset.curriculum.coverage_threshold_end) == (0.5, 0.2)
-    assert (preset.env.local_ratio, preset.curriculum.local_ratio_end) == (0.5, 0.1)
+    assert (preset.env.coverage_threshold, preset.env.coverage_threshold_end) == (0.5, 0.2)
+    assert (preset.env.local_ratio, preset.env.local_ratio_end) == (0.5, 0.1)
     assert algorithm.schedule_episodes == preset.curriculum.episodes == 1500
     assert preset.num_updates == preset.training.env_steps == 1500 * preset.env.max_cycles == 1500 * 75
     assert (preset.env.reward, preset.env.reset_on_collision) == ("paper", "off")
@@ -578,6 +580,44 @@ def test_an_update_is_one_step_of_adam(updates):
         assert abs(along / length - 1) < 1e-4  # the rates of neighbouring episodes differ by 9e-4
 
 
+@pytest.mark.parametrize(
+    ("progress", "measured", "followed"),
+    [
+        ("served", {"served": 0.25}, 0.25),
+        ("served", {"served": 0.25, "coverage_theta": 0.75}, 0.75),  # the paper's own, where there is one
+        (None, {"served": 0.25}, 0.0),
+    ],
+)
+def test_other_tasks_are_explored_by_their_own_progress(monkeypatch, progress, measured, followed):
+    """Two steps, in which it is the same: the second is at ε = 0.3 + 0.2 · (1 - c)."""
+    monkeypatch.setattr(
+        gacrl_paper,
+        "loss",
+        lambda network, *rest: (network.critic.w8.bias.sum(), {"loss": rest[1].reward[-1]}),
+    )
+    update = jax.jit(gacrl_paper.make(CONFIG, ENV, None, progress).update)
+    step = Transition(
+        observation=observe(),
+        decision=jax.tree.map(lambda leaf: leaf[0], ACT(fixed_learner(), observe(), KEYS)),
+        reward=jnp.zeros(N),
+        terminated=jnp.asarray(False),
+        truncated=jnp.asarray(False),
+        first=jnp.asarray(True),
+        next_observation=observe(),
+        info={name: jnp.float32(value) for name, value in measured.items()},
+    )
+    rollout = Rollout(jax.tree.map(lambda leaf: leaf[None, None], step), (), ())
+    learner, metrics = update(fixed_learner(), rollout, jax.random.key(0))
+    np.testing.assert_allclose(metrics["epsilon"], 0.5, rtol=1e-6)
+    _, metrics = update(learner, rollout, jax.random.key(1))
+    np.testing.assert_allclose(metrics["epsilon"], 0.3 + 0.2 * (1 - followed), rtol=1e-6)
+
+
+def test_continuous_actions_are_refused():
+    with pytest.raises(ConfigError, match="gacrl_paper needs discrete actions"):
+        gacrl_paper.make(CONFIG, dataclasses.replace(ENV, continuous_actions=True))
+
+
 def test_environments_side_by_side_share_one_coverage(monkeypatch):
     """Two environments, two steps, a stand-in loss: four gradient steps, two episodes of mean coverage 5/12.
 
@@ -619,8 +659,8 @@ def test_curriculum_moves_once_an_episode():
     """Local ratio .5 → .1 and θ .5 → .2 over 1500 episodes; steps within an episode change nothing."""
     env = Spread(N, 3, max_cycles=75, reward="paper")
     paper = presets.preset("paper")
-    advancing = curriculum.make(paper.curriculum)
     base = env.default_params()
+    advancing = curriculum.make(paper.curriculum, TASK, paper.env, base)
 
     def advance(state, done):
         done = jnp.asarray(done)
@@ -645,8 +685,8 @@ def test_curriculum_moves_once_an_episode():
 
 
 def test_no_curriculum_leaves_the_task_alone():
-    still = curriculum.make(CurriculumConfig())
     params = ENV.default_params()
+    still = curriculum.make(CurriculumConfig(), TASK, ENV, params)
     done = jnp.ones((1, 1), bool)
     rollout = Rollout(SimpleNamespace(terminated=done, truncated=done), (), ())
     assert still.advance(still.init(params)[0], jnp.int32(9), rollout)[1] is params

@@ -1,5 +1,6 @@
 """PPO: its formulas by hand and as rlax has them, its targets, its segments, and a first ratio of 1."""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -294,23 +295,58 @@ def test_targets_minibatches_and_step_sizes(reward: Any, seen: list[Seen]):
 # The policy that acted is the one that is learned from.
 
 SPREAD = Spread(3, 2, max_cycles=3)
-NETWORKS = {
-    "discrete symbols": (NetworkConfig(width=8, depth=1, communication="discrete"), False),
-    "commnet, recurrent": (NetworkConfig(width=8, depth=1, recurrent=True, communication="commnet"), False),
-    "dial, recurrent, turned": (NetworkConfig(width=8, depth=1, recurrent=True, communication="dial"), True),
+
+
+@dataclass(frozen=True)
+class Slots(Spread):
+    """The same shapes; the first agent's life ends with the second step of every episode."""
+
+    def step(self, state: Any, action: Any, key: Any, params: Any = None) -> Any:
+        state, after = super().step(state, action, key, params)
+        return state, after._replace(left=(state.clock == 2) & (jnp.arange(self.num_agents) == 0))
+
+
+class Case(NamedTuple):
+    communication: str
+    recurrent: bool = False
+    augment: bool = False
+    exploration: str = "none"
+    lives: bool = False
+
+
+CASES = {
+    "discrete symbols": Case("discrete"),
+    "commnet, recurrent": Case("commnet", recurrent=True),
+    "dial, recurrent, turned": Case("dial", recurrent=True, augment=True),
+    "discrete symbols, explored linearly": Case("discrete", exploration="linear"),
+    "discrete symbols, explored as ever": Case("discrete", exploration="fixed"),
+    "discrete symbols, explored by progress": Case("discrete", exploration="adaptive"),
+    "commnet, recurrent, explored by progress": Case("commnet", recurrent=True, exploration="adaptive"),
+    "commnet, recurrent, lives end inside the episode": Case("commnet", recurrent=True, lives=True),
+    "dial, recurrent, lives end inside the episode": Case("dial", recurrent=True, lives=True),
+    "discrete symbols, lives end inside the episode": Case("discrete", lives=True),
 }
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", CASES)
 def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
     """In a rollout that begins mid-episode, with an episode's end in it.
 
-    And targets bootstrap from the critic's value, with its memory, of what followed: λ = 0 and γ = 1 show it.
+    And targets bootstrap from the critic's value, with its memory, of what followed: λ = 0 and γ = 1 show it. Nothing
+    follows a life's end.
     """
-    network, augment = NETWORKS[name]
+    case = CASES[name]
+    augment, env = case.augment, Slots(3, 2, max_cycles=3) if case.lives else SPREAD
     config = MappoConfig(
-        network=network,
+        network=NetworkConfig(width=8, depth=1, recurrent=case.recurrent, communication=case.communication),
         augment=augment,
+        exploration=case.exploration,
+        epsilon=0.8,
+        epsilon_end=0.4,
+        temperature=2.0,
+        temperature_end=0.5,
+        exploration_steps=64,
+        greedy_share=0.5,
         update_epochs=1,
         num_minibatches=1,
         clip_eps=1e-4,
@@ -328,25 +364,30 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(ppo, "loss", spy)
 
-    algorithm = mappo.make(config, SPREAD, TrainingConfig(env_steps=100, num_envs=4, num_steps=4))
-    memory, params = algorithm.initial_memory(3), SPREAD.default_params()
-    learner, other = (drawn_learner(algorithm, seed) for seed in (0, 1))
+    algorithm = mappo.make(config, env, TrainingConfig(env_steps=100, num_envs=4, num_steps=4), "coverage_0.2")
+    memory, params = algorithm.initial_memory(3), env.default_params()
+    # Half of the way down: after two updates of 16 steps.
+    learner, other = (drawn_learner(algorithm, seed)._replace(updates=jnp.int32(2)) for seed in (0, 1))
 
     @jax.jit
     def collect(learner: Any) -> Any:
         """From the second step of episodes on."""
-        carry = rollout.start(SPREAD, params, memory, jax.random.key(2), 4)
+        carry = rollout.start(env, params, memory, jax.random.key(2), 4)
         clock = carry.env_state.clock + 1
         under_way = carry._replace(
             env_state=carry.env_state._replace(clock=clock),
-            memory=jax.tree.map(lambda leaf: leaf + 0.3, carry.memory),
+            memory=jax.tree.map(lambda leaf: leaf + 0.3 if leaf.ndim > 1 else leaf, carry.memory),
             first=carry.first & False,
         )
         policy = algorithm.policy(learner, True)
-        return rollout.collect(SPREAD, policy, memory, params, under_way, jax.random.key(3), 4)[1]
+        return rollout.collect(env, policy, memory, params, under_way, jax.random.key(3), 4)[1]
 
     experience = collect(learner)
     assert not experience.transitions.first[0].any() and experience.transitions.truncated.sum() == 4
+    levels = {"linear": [0.6], "adaptive": [0.0, 0.8]}.get(case.exploration)
+    if levels is not None:
+        found = np.unique(experience.transitions.decision.extras["epsilon"])
+        np.testing.assert_allclose(found, levels, rtol=1e-6)
     update = jax.jit(algorithm.update)
     _, metrics = update(learner, experience, jax.random.key(5))
     jax.effects_barrier()
@@ -355,9 +396,11 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
     _, metrics = update(other, experience, jax.random.key(5))
     assert metrics["ratio_clipped"] > 0.9
 
-    expected = steps.reward[:-1] + steps.decision.extras["value"][1:]
+    left = np.zeros((4, 4, 3), bool) if steps.left is None else np.asarray(steps.left)
+    assert left.any((1, 2)).tolist() == [case.lives, False, False, case.lives], "one life goes on with the rollout"
+    expected = steps.reward[:-1] + np.where(left[:-1], 0.0, steps.decision.extras["value"][1:])
     going_on = ~np.asarray(steps.truncated)[:-1]
-    if not jax.tree.leaves(memory):  # every step is a segment
+    if not case.recurrent:  # every step is a segment
         rows = [row.tobytes() for row in np.asarray(sample.observation.features)[0]]
         target = dict(zip(rows, np.asarray(sample.target)[0], strict=True))
         for t, place in np.argwhere(going_on):
@@ -365,15 +408,18 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
             np.testing.assert_allclose(target[key], expected[t, place], atol=1e-4)
         return
     turned: list[bool] = []
+    carried = experience.first_memory._replace(exploration=())  # of exploration nothing is learned
     for column in range(4):  # an environment is a segment, and has its own memory
         chosen_with = np.asarray(sample.log_prob)[:, column]  # stays, also where the world is turned
         (place,) = (e for e in range(4) if np.array_equal(steps.decision.extras["log_prob"][:, e], chosen_with))
         features = np.asarray(sample.observation.features)[:, column]
         turned.append(not np.array_equal(steps.observation.features[:, place], features))
-        for found, leaf in zip(jax.tree.leaves(remembered), jax.tree.leaves(experience.first_memory), strict=True):
+        for found, leaf in zip(jax.tree.leaves(remembered), jax.tree.leaves(carried), strict=True):
             np.testing.assert_array_equal(
                 found[column], (not augment) * leaf[place], "a turned world is not remembered"
             )
         on = going_on[:, place]
         np.testing.assert_allclose(sample.target[:-1, column][on], expected[:, place][on], atol=1e-4)
+        gone = left[-1, place]
+        np.testing.assert_allclose(sample.target[-1, column][gone], steps.reward[-1, place][gone], atol=1e-4)
     assert any(turned) == augment

@@ -1,5 +1,6 @@
 """Q-learning from replay: its targets against NumPy and rlax, windows of the ring, exploration, slow targets."""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,10 +13,11 @@ from conftest import drawn_learner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gacrl.algorithms import exploration, q_learning, replay
+from gacrl.algorithms import q_learning, replay
+from gacrl.algorithms.iql import independent
 from gacrl.algorithms.q_learning import Network, Parts, epsilon_greedy
-from gacrl.algorithms.qmix import MIXERS
-from gacrl.config.algorithms import QmixConfig
+from gacrl.algorithms.vdn import summed
+from gacrl.config.algorithms import IqlConfig, VdnConfig
 from gacrl.config.run import TrainingConfig
 from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
 from gacrl.tasks.spread.environment import Spread
@@ -56,6 +58,15 @@ def features(seed: int, steps: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(steps, N, ENV.observation_size)).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class Slots(Spread):
+    """The same shapes, of a task in which lives end inside an episode."""
+
+    def step(self, state: Any, action: Any, key: Any, params: Any = None) -> Any:
+        state, after = super().step(state, action, key, params)
+        return state, after._replace(left=jnp.zeros(self.num_agents, bool))
+
+
 class Case(NamedTuple):
     mixer: Any
     n_step: int
@@ -66,6 +77,8 @@ class Case(NamedTuple):
     time_limits: tuple[int, ...] = (3,)
     unknown: int | None = None
     """A time limit too many: its own value stands in for what followed."""
+    lives: bool = False
+    """The first agent's life ends at step 2, and another one takes its slot."""
 
 
 def hand_made(steps: int, case: Case) -> Rollout:
@@ -95,6 +108,7 @@ def hand_made(steps: int, case: Case) -> Rollout:
             first=jnp.asarray(np.concatenate([[[False]], done[:-1]])),
             next_observation=after,
             info={},
+            left=jnp.asarray((end == 2)[..., None] & (np.arange(N) == 0)) if case.lives else None,
         ),
         (),
         (),
@@ -111,32 +125,34 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
         earned = reward[:, REAL]
         reward = (reward[:, REAL] - earned.mean()) / earned.std()
         reward = np.concatenate([reward, np.zeros((len(reward), 1))], axis=1)
-    carry, errors = 2.0, []
+    left = np.zeros((len(here), N), bool) if steps.left is None else steps.left
+    carry, errors = np.full(N, 2.0), []
     remembered = []
     for t in range(len(here)):
-        carry = 0.0 if steps.first[t] else carry
-        remembered.append(carry)
-        carry += 1
+        carry = np.zeros(N) if steps.first[t] else carry
+        remembered.append(carry[:, None])
+        carry = np.where(left[t], 0.0, carry + 1)
     bonus = 0.5 if case.remembers else 0.0
     for t in range(case.learned):
-        total, k = np.zeros(N), 0
+        total, k, alive = np.zeros(N), 0, np.ones(N, bool)
         while True:
             shared = np.full(N, reward[t + k][REAL].mean()) if team else reward[t + k]
-            total += GAMMA**k * shared
+            total += np.where(alive, GAMMA**k * shared, 0.0)
+            alive &= ~left[t + k] | team  # the team lives on
             last = t + k
             k += 1
             if k == case.n_step or steps.terminated[last] or steps.truncated[last]:
                 break
-        seen, heard = (
-            (after[last], remembered[last] + 1) if last != case.unknown else (here[last], remembered[last])
-        )
+        forgotten = np.where(left[last][:, None], 0.0, remembered[last] + 1)
+        seen, heard = (after[last], forgotten) if last != case.unknown else (here[last], remembered[last])
         online, slow = scale * seen + bonus * heard, target_scale * seen + bonus * heard
         best = (online if case.double_q else slow).argmax(-1)
         future = slow[np.arange(N), best]
         value = (scale * here[t] + bonus * remembered[t])[np.arange(N), steps.decision.action[t]]
         if team:
             total, future, value = total[:1], future[REAL].sum(keepdims=True), value[REAL].sum(keepdims=True)
-        target = total + (0.0 if steps.terminated[last] else GAMMA**k * future)
+        going_on = alive if not team else alive[:1]
+        target = total + (0.0 if steps.terminated[last] else np.where(going_on, GAMMA**k * future, 0.0))
         errors.append((value - target)[REAL] if not team else value - target)
     return np.array(errors)
 
@@ -149,6 +165,9 @@ CASES = {
     "VDN, recurrent, with time limits sooner than the task says": Case(
         "vdn", 3, 4, True, time_limits=(0, 2, 3), unknown=3
     ),
+    "IQL, lives end inside the episode": Case("iql", 3, 4, False, lives=True),
+    "IQL, recurrent, lives end inside the episode": Case("iql", 3, 4, True, lives=True),
+    "VDN, recurrent, lives end inside the episode": Case("vdn", 3, 4, True, lives=True),
 }
 
 
@@ -157,8 +176,8 @@ def test_the_loss_is_that_of_the_text(name: str):
     """On a window with an end of the task and a time limit in it. VDN has the team's reward, also of 'own' ones."""
     case = CASES[name]
     steps = case.learned + case.n_step - 1
-    config = QmixConfig(
-        mixer=case.mixer,
+    kind, value = {"iql": (IqlConfig, independent), "vdn": (VdnConfig, summed)}[case.mixer]
+    config = kind(
         n_step=case.n_step,
         sequence_length=case.learned,
         double_q=case.double_q,
@@ -172,14 +191,13 @@ def test_the_loss_is_that_of_the_text(name: str):
         learning_rate=0.01,
         learning_rate_end=0.01,
         target_step=0.25,
+        epsilon_end=0.1,
+        exploration_steps=100,
     )
-    parts = Parts(
-        networks=lambda key: Network(Table(case.remembers), ()),
-        team_value=MIXERS[case.mixer],
-        exploration=exploration.linear((1.0, 0.1), 100),
-        auxiliary=lambda output: {},
-    )
-    algorithm = q_learning.make(config, ENV, TrainingConfig(env_steps=1_000, num_envs=1, num_steps=steps), parts)
+    parts = Parts(lambda key: Network(Table(case.remembers), ()), value, own_values=case.mixer == "iql")
+    training = TrainingConfig(env_steps=1_000, num_envs=1, num_steps=steps)
+    env = Slots(N, 1) if case.lives else ENV
+    algorithm = q_learning.make(config, env, training, None, parts)
     update = jax.jit(algorithm.update)
 
     def at(network: Network, scale: float) -> Network:

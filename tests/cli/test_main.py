@@ -20,15 +20,16 @@ import pytest
 from conftest import TinyRun
 from PIL import Image
 
-from gacrl import play, tasks
+from gacrl import play
 from gacrl.adapters import mpe2
 from gacrl.cli import main as cli
 from gacrl.cli.main import main
 from gacrl.config import files as configuration
 from gacrl.config import presets
+from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.experiments import scoring
-from gacrl.tasks.spread import scripted
+from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import checkpoint
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]  # the tiny run's
@@ -389,15 +390,17 @@ def test_the_real_mpe2_gives_the_same_within_sampling_error(
 ):
     episodes, member, key = 100, f"{tiny_run.folder}@1", stream_key("report")
     opened = play.open_run(member)
-    env = tasks.make(opened.config.env)
-    noop, memory = scripted.make("noop", env)
+    env = opened.env
+    noop, memory = references.noop(env)
     ours = {
         "run": opened.trainer.evaluate(opened.learners, False, "report", episodes),
-        "noop": jax.jit(lambda: evaluate(env, noop, memory, env.default_params(), key, episodes))(),
+        "noop": jax.jit(
+            lambda: evaluate(env, noop, memory, env.default_params(), key, episodes, metrics=METRICS)
+        )(),
     }
 
-    references = {"random": dict.fromkeys(ours["noop"], 0.0), "oracle": dict.fromkeys(ours["noop"], 1.0)}
-    monkeypatch.setattr(scoring, "_references", lambda *task: references)  # playing those takes long
+    beside = {"random": dict.fromkeys(ours["noop"], 0.0), "oracle": dict.fromkeys(ours["noop"], 1.0)}
+    monkeypatch.setattr(scoring, "_references", lambda *task: beside)  # playing those takes long
     answer = answered("evaluate", member, "--backend", "mpe2", "--episodes", episodes)
     assert answer["backend"] == "mpe2"
     theirs = {

@@ -11,18 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gacrl import tasks
 from gacrl.config import presets
 from gacrl.config.algorithms import GacrlPaperConfig
-from gacrl.config.files import dumps, fingerprint, from_dict, load, to_dict
+from gacrl.config.files import dumps, fingerprint, from_dict, load, on_task, to_dict
 from gacrl.config.presets import PRESETS, preset
-from gacrl.config.run import CurriculumConfig, EnvConfig, EvaluationConfig, RunConfig, TrainingConfig
+from gacrl.config.run import CurriculumConfig, EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.errors import ConfigError
+from gacrl.tasks.spread.settings import SpreadSettings
+from gacrl.tasks.task import Task
 
 PAPER = preset("paper")
 UNUSUAL = RunConfig(
     algorithm=GacrlPaperConfig(encoder_hidden=(7,), policy_hidden=(5, 6), messages="straight_through", radius=0.3),
-    env=EnvConfig(num_agents=5, num_landmarks=2, terminate_on_success=True, reward="paper"),
-    curriculum=CurriculumConfig(local_ratio_end=0.2),
+    env=SpreadSettings(
+        num_agents=5, num_landmarks=2, terminate_on_success=True, reward="paper", local_ratio_end=0.2
+    ),
+    curriculum=CurriculumConfig(episodes=20, gate=0.5),
     training=TrainingConfig(env_steps=7, num_envs=2, num_steps=3),
     evaluation=EvaluationConfig(horizon=9),
     preset="paper",
@@ -111,12 +116,16 @@ def test_the_fingerprint_follows_every_setting_that_training_depends_on():
         ({"algorithm": {"learnig_rate": 0.1}}, "algorithm.learnig_rate", "algorithm.learning_rate"),
         ({"algorithm": {"name": "gacrl_papre"}}, "gacrl_papre", "gacrl_paper"),
         ({"preset": "papre"}, "papre", "paper"),
+        ({"env": {"name": "spred"}}, "spred", "spread"),
+        ({"algorithm": {"network": {"communication": "discret"}}}, "discret", "discrete"),
+        ({"algorithm": {"exploration": "adaptiv"}}, "adaptiv", "adaptive"),
     ],
 )
 def test_an_unknown_key_is_refused_with_the_nearest_one(data: Any, named: str, meant: str, tmp_path: Path):
+    learner = "exploration" in str(data) or "communication" in str(data)  # which the paper's algorithm has not
     for attempt in (
         lambda: from_dict(data),
-        lambda: from_dict(data, UNUSUAL),
+        lambda: from_dict(data, preset("gacrl") if learner else UNUSUAL),
         lambda: load(write(tmp_path, data)),
     ):
         with pytest.raises(ConfigError) as refused:
@@ -185,11 +194,9 @@ def test_none_at_all_is_refused(path: str):
 
 def test_settings_made_in_python_are_checked_too():
     with pytest.raises(ConfigError, match="env.num_agents must be between 1 and 10000, not 0"):
-        EnvConfig(num_agents=0)
+        SpreadSettings(num_agents=0)
     with pytest.raises(ConfigError, match="must not exceed 1, a probability"):
         GacrlPaperConfig(epsilon=0.9)
-    with pytest.raises(ConfigError, match="discrete actions"):
-        RunConfig(algorithm=GacrlPaperConfig(), env=EnvConfig(continuous_actions=True))
 
 
 @pytest.mark.parametrize(
@@ -274,3 +281,64 @@ def values(config: Any) -> Iterator[Any]:
             yield from values(value)
         else:
             yield value
+
+
+FORMER = {
+    "algorithm": {"name": "qmix", "mixer": "vdn", "mixer_width": 32, "epsilon_steps": 9, "learning_rate": 0.5},
+    "env": {"name": "spread", "num_agents": 4},
+    "curriculum": {"local_ratio_end": 0.1, "num_agents_start": None, "episodes": 7, "gate": None},
+    "preset": "vdn",
+}
+"""As version 0.1.0 wrote settings."""
+
+
+def test_settings_of_version_0_1_0_load_under_their_names_of_today():
+    config = from_dict(FORMER)
+    assert (config.algorithm.name, config.algorithm.exploration_steps, config.algorithm.learning_rate) == (
+        "vdn",
+        9,
+        0.5,
+    )
+    assert config.env == SpreadSettings(num_agents=4, local_ratio_end=0.1)
+    assert config.curriculum == CurriculumConfig(episodes=7)
+    yoked = {"algorithm": {"name": "gacrl", "yoked_coverage": [0.5], "coverage_radius": "0.2"}}
+    assert from_dict(yoked).algorithm.yoked_progress == (0.5,)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"curriculum": {"local_ratio_end": 0.1, "gate": 0.5}},
+            "curriculum.gate of gacrl 0.1.0 followed the coverage",
+        ),
+        ({"algorithm": {"name": "gacrl", "coverage_radius": "0.1"}}, "was a setting of gacrl 0.1.0"),
+    ],
+)
+def test_what_no_later_version_does_is_refused_with_the_version_that_did(change: Any, said: str):
+    with pytest.raises(ConfigError, match=said):
+        from_dict(change)
+
+
+@dataclasses.dataclass(frozen=True)
+class MarketSettings:
+    stalls: int = 3
+    prices: tuple[float, ...] = (1.0,)
+
+
+def test_settings_of_a_task_from_outside_load_once_it_is_at_hand(monkeypatch: pytest.MonkeyPatch):
+    """A preset's task settings apply to its own task alone; a file that names a task needs it."""
+    data = {"env": {"name": "Market", "stalls": 5}, "preset": "paper"}
+    with pytest.raises(ConfigError, match="unknown task 'Market': .*a task of your own is --env FILE.py:NAME"):
+        from_dict(data)
+    monkeypatch.setattr(tasks, "_OWN", {})
+    tasks.bring(tasks.Own(Task("Market", MarketSettings, lambda settings: None), MarketSettings()))
+    config = from_dict(data)
+    assert (config.task, config.env) == ("Market", MarketSettings(stalls=5))
+    assert config.algorithm == PAPER.algorithm
+    assert from_dict(json.loads(dumps(config))) == config
+    assert on_task(PAPER, "Market").env == MarketSettings() and on_task(PAPER, "spread") is PAPER
+    with pytest.raises(ConfigError, match="unknown setting 'env.stals': did you mean 'env.stalls'"):
+        from_dict({"env": {"name": "Market", "stals": 5}})
+    with pytest.raises(ConfigError, match="there is a task 'spread' already"):
+        tasks.bring(tasks.Own(Task("spread", MarketSettings, lambda settings: None), MarketSettings()))

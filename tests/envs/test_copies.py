@@ -9,29 +9,32 @@ import pytest
 
 from gacrl.envs import copies
 from gacrl.envs.probes import Probe
-from gacrl.tasks.spread.environment import Spread, SpreadParams
+from gacrl.tasks.spread.environment import Spread
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
 E = 6
 KEY = jax.random.key(0)
-MASKED = SpreadParams(
-    agent_mask=jnp.array([True, True, True, False]), landmark_mask=jnp.array([True, False, True])
-)
+MASKS = {"agent_mask": jnp.array([True, True, True, False]), "landmark_mask": jnp.array([True, False, True])}
 
 
 @pytest.mark.parametrize(
-    "env",
+    ("env", "masks"),
     [
-        Spread(),
-        Spread(5, 5, num_agent_neighbors=2, num_landmark_neighbors=7),
-        Spread(4, 3, reward="coverage", reset_on_collision="in_place", initial_params=MASKED),
-        Spread(reward="paper", continuous_actions=True, reset_on_collision="truncate", terminate_on_success=True),
+        (Spread(), {}),
+        (Spread(5, 5, num_agent_neighbors=2, num_landmark_neighbors=7), {}),
+        (Spread(4, 3, reward="coverage", reset_on_collision="in_place"), MASKS),
+        (
+            Spread(
+                reward="paper", continuous_actions=True, reset_on_collision="truncate", terminate_on_success=True
+            ),
+            {},
+        ),
     ],
     ids=["standard", "neighbours", "padded", "continuous"],
 )
-def test_a_step_of_many_is_the_step_of_each(env):
-    params = env.default_params()._replace(landmark_speed=0.3, reset_distance=0.4)
+def test_a_step_of_many_is_the_step_of_each(env, masks):
+    params = env.default_params()._replace(landmark_speed=0.3, reset_distance=0.4, **masks)
     mapped = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
     at_once = jax.jit(env.step_many)
     look = jax.jit(env.observe_many)

@@ -13,8 +13,10 @@ from gacrl.config import presets
 from gacrl.config.algorithms import GacrlConfig
 from gacrl.config.run import RunConfig
 from gacrl.experiments import ablate
-from gacrl.experiments.ablate import FULL, METRICS, PARTS, SCORE, YOKED, plan
+from gacrl.experiments.ablate import FULL, YOKED, parts_of, plan
 from gacrl.experiments.study import DIVERGED, Planned
+from gacrl.tasks.spread.settings import METRICS
+from gacrl.tasks.task import HEADLINE
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
@@ -22,6 +24,9 @@ from gacrl.training.session import Watcher
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
+PARTS = parts_of(presets.preset("gacrl-112k"))
+"""Of every task, and of spread."""
+SCORE = HEADLINE
 STEPS = (100, 200, 300, 400)
 EPSILON = np.array([[1.0, 0.51, 0.265, 0.02], [1.0, 0.51, 0.265, 0.02]])
 """With ε from 1 to 0.02: coverages 0, 1 − √½, ½, 1."""
@@ -46,7 +51,7 @@ def test_each_run_differs_from_the_whole_in_its_part_alone(planned: dict[str, Pl
             for key, value in configuration.to_dict(config)["algorithm"].items()
             if value != configuration.to_dict(whole)["algorithm"][key]
         }
-        assert changed <= {*part.changes.get("algorithm", {}), "yoked_coverage"}
+        assert changed <= {*part.changes.get("algorithm", {}), "yoked_progress"}
         assert (config.env != whole.env) == ("env" in part.changes)
         assert config.training == whole.training
 
@@ -111,8 +116,10 @@ def test_the_command_says_what_each_part_is_worth(
     runs = {run["name"]: run for run in answer["runs"]}
     assert list(runs) == [FULL, *parts]
     assert runs[FULL]["probability_that_the_part_helps"] is None
-    assert runs["no-messages"]["probability_that_the_part_helps"] == [1.0, 1.0, 1.0]
-    assert runs["no-symmetry"]["probability_that_the_part_helps"][0] == 0.0
+    worth = runs["no-messages"]["probability_that_the_part_helps"]
+    assert set(worth) >= {SCORE, "coverage_final_0.1", "collisions"}, "every metric of the tables"
+    assert worth[SCORE] == [1.0, 1.0, 1.0] and worth["collisions"] == [0.0, 0.0, 0.0], "fewer are better"
+    assert runs["no-symmetry"]["probability_that_the_part_helps"][SCORE][0] == 0.0
     assert runs["no-coverage-bonus"]["diverged"] == "seed 0 diverged: loss is nan"
     assert (out / "no-coverage-bonus" / DIVERGED).is_file()
     assert runs["no-messages"]["intervals"][SCORE][0] == pytest.approx(0.701)
@@ -120,7 +127,7 @@ def test_the_command_says_what_each_part_is_worth(
     algorithm = trained[-1].algorithm
     assert isinstance(algorithm, GacrlConfig)
     assert algorithm.exploration == "yoked"
-    np.testing.assert_allclose(algorithm.yoked_coverage, [0, 1 - np.sqrt(0.5), 0.5, 1], atol=1e-4)
+    np.testing.assert_allclose(algorithm.yoked_progress, [0, 1 - np.sqrt(0.5), 0.5, 1], atol=1e-4)
 
     page = Path(answer["report"]).read_text(encoding="utf-8")
     assert "diverged: seed 0 diverged" in page

@@ -11,9 +11,9 @@ from conftest import TinyRun
 
 from gacrl.config import presets
 from gacrl.config.run import RunConfig
-from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments.paper.evidence import read_series
 from gacrl.experiments.study import DIVERGED, Planned, Watch, train_missing
+from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
@@ -53,7 +53,7 @@ def watched(names: list[str], stop_after: int | None = None) -> Watch:
 def test_a_stopped_run_is_resumed_and_a_finished_one_left_alone(
     tiny_run: TinyRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    nothing = {who: dict.fromkeys(EPISODE_METRICS, 0.0) for who in ("random", "noop", "oracle")}
+    nothing = {who: dict.fromkeys(METRICS, 0.0) for who in ("random", "noop", "oracle")}
     monkeypatch.setattr(session, "evaluate_scripted", lambda *task: nothing)  # long to compile, and not at stake
     folders = [Path(shutil.copytree(tiny_run.folder, tmp_path / name)) for name in ("finished", "stopped")]
     runs = [Planned(path.name, RunFolder.open(path).config(), path) for path in folders]

@@ -15,18 +15,12 @@ def episode(symbols: list[list[int]], vocabulary: int = 4) -> Episode:
     steps = len(spoken)
     messages = np.where(spoken[..., None] == np.arange(vocabulary), 1.0, 0.0)
     return Episode(
-        positions=np.zeros((steps + 1, 2, 2)),
-        landmarks=np.zeros((steps + 1, 2, 2)),
         actions=np.zeros((steps, 2), int),
         messages=messages,
         adjacency=np.ones((steps, 2, 2), bool),
         reward=np.zeros((steps, 2)),
         reward_raw=np.zeros(steps),
-        agent_mask=np.ones(2, bool),
-        landmark_mask=np.ones(2, bool),
-        agent_radius=0.15,
-        capture_radius=0.1,
-        arena_scale=1.0,
+        agent_mask=np.ones((steps, 2), bool),
     )
 
 
@@ -47,8 +41,11 @@ def test_bits_are_the_entropy_of_what_is_sent(symbols: list[list[int]], bits: fl
 def test_episodes_are_counted_together_and_padding_not():
     first, second = episode([[0, 0], [0, 0]]), episode([[1, 1]])
     assert bits_used([first, second, second]) == pytest.approx(1.0)
-    padded = replace(episode([[0, 3], [1, 3]]), agent_mask=np.array([True, False]))
+    padded = replace(episode([[0, 3], [1, 3]]), agent_mask=np.array([[True, False], [True, False]]))
     assert bits_used([padded]) == pytest.approx(1.0)
+    # What is in the place of an agent that has left, or has not come yet, is not said.
+    joining = replace(episode([[0, 3], [1, 1]]), agent_mask=np.array([[True, False], [True, True]]))
+    assert bits_used([joining]) == pytest.approx(0.9182958)  # ⅓ log2(3) + ⅔ log2(3/2)
 
 
 def test_what_is_no_symbol_has_no_bits():

@@ -13,7 +13,7 @@ from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.probes import Probe
 from gacrl.networks.agent import AgentMemory, AgentNetwork, matched, unroll
 from gacrl.networks.layers import num_parameters
-from gacrl.tasks.spread.environment import Spread, SpreadParams
+from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -53,7 +53,7 @@ def test_messages_of_padded_agents_are_nothing():
     env = Spread(3, 2)
     network: AgentNetwork = drawn(AgentNetwork, env, NetworkConfig(width=8, vocabulary=3, communication="dial"), 5)
     mask = jnp.array([True, False, True])
-    _, seen = env.reset(jax.random.key(0), SpreadParams(agent_mask=mask))
+    _, seen = env.reset(jax.random.key(0), env.default_params()._replace(agent_mask=mask))
     memory = network.initial_memory(3)
     assert isinstance(memory, AgentMemory) and memory.carry == ()
     output, _ = eqx.filter_jit(lambda *inputs: network(*inputs))(seen, memory, jax.random.key(2), Channel())

@@ -7,13 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import drawn
+from conftest import drawn, drawn_learner
 
-from gacrl.config.algorithms import NetworkConfig
+from gacrl import rollout
+from gacrl.algorithms import build as algorithms
+from gacrl.config.algorithms import IppoConfig, NetworkConfig, VdnConfig
+from gacrl.config.kinds import COMMUNICATION
+from gacrl.config.run import TrainingConfig
 from gacrl.envs.probes import Probe
+from gacrl.errors import ConfigError
 from gacrl.networks import communication
 from gacrl.networks.agent import AgentMemory, AgentNetwork, unroll
-from gacrl.networks.communication import Neighbourhood, discretise_regularise
+from gacrl.networks.communication import Communication, Neighbourhood, Spoken
+from gacrl.networks.communication.dial import discretise_regularise
 from gacrl.networks.graph import proximity_adjacency
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Channel
@@ -231,3 +237,83 @@ def test_gradients_flow_from_hearer_to_speaker(kind: str):
         assert same_step > 1e-3 and later == 0
     assert (found[:, 1, :, 0] == 0).all()  # nothing from 0 to 1
     assert (found[0, :, 1, :] == 0).all()  # nor backward in time
+
+
+# Kinds by name.
+
+
+def test_a_kind_that_nobody_knows_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"unknown algorithm\.network\.communication 'dail': did you mean 'dial'"
+    ):
+        NetworkConfig(communication="dail")
+
+
+def test_what_is_said_is_heard_late_where_there_is_an_inbox():
+    kinds = {name: communication.hears_late(NetworkConfig(width=4, communication=name)) for name in COMMUNICATION}
+    assert kinds == {"none": False, "commnet": False, "dial": True, "discrete": False, "soft": False}
+    symbols = {
+        name for name in COMMUNICATION if communication.kind_of(NetworkConfig(communication=name)).sends_symbols
+    }
+    assert symbols == {"discrete"}
+
+
+class Shout(Communication):
+    """Everyone hears the sum of what all hold, for a price: agent i pays i times the loudness, squared."""
+
+    loudness: jax.Array
+
+    def __init__(self, config: NetworkConfig, key: Any, gain: float | None = None):
+        self.loudness = jnp.ones(config.vocabulary)
+
+    def speak(self, hidden: Any, near: Any, channel: Any, key: Any, temperature: Any, code: Any = None) -> Spoken:
+        agents = jnp.arange(hidden.shape[0])
+        return Spoken(hidden, hidden[:, :2], loss=agents * jnp.square(self.loudness).mean())
+
+
+@pytest.fixture
+def shouting(monkeypatch: pytest.MonkeyPatch) -> NetworkConfig:
+    monkeypatch.setitem(COMMUNICATION, "shout", Shout)
+    return NetworkConfig(width=8, communication="shout", vocabulary=3)
+
+
+def test_a_kind_of_ones_own_may_have_a_loss(shouting: NetworkConfig):
+    env = Probe()
+    network = drawn(AgentNetwork, env, shouting, 2)
+    network = eqx.tree_at(lambda network: network.communication.loudness, network, jnp.full(3, 2.0))
+    _, seen = env.reset(jax.random.key(0))
+    output, _ = network(seen)
+    np.testing.assert_array_equal(output.message_loss, [0.0, 4.0])
+    np.testing.assert_array_equal(output.message, output.hidden[:, :2])
+    seen = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, *leaf.shape)), seen)
+    outputs, _ = unroll(network, seen, jnp.zeros(3, bool), (), None)
+    np.testing.assert_array_equal(outputs.message_loss, [[0.0, 4.0]] * 3)
+    quiet, _ = drawn(AgentNetwork, env, NetworkConfig(width=8, communication="commnet"), 2)(
+        jax.tree.map(lambda leaf: leaf[0], seen)
+    )
+    assert quiet.message_loss is None
+
+
+@pytest.mark.parametrize("kind", [IppoConfig, VdnConfig])
+def test_every_learner_minimises_the_loss_of_the_messages(kind: Any, shouting: NetworkConfig):
+    """Its mean over the agents is ½ at loudness 1; one step of Adam makes it quieter, which nothing else would."""
+    learning = {"updates": 1, "learning_starts": 0, "batch_size": 4}
+    if kind is IppoConfig:
+        learning = {"update_epochs": 1, "num_minibatches": 1}
+    env, training = Probe(), TrainingConfig(env_steps=1_000, num_envs=2, num_steps=4)
+    config = kind(network=shouting, learning_rate=0.01, learning_rate_end=0.01, **learning)
+    algorithm = algorithms.make(config, env, training)
+    learner, memory, params = drawn_learner(algorithm), algorithm.initial_memory(2), env.default_params()
+    where = lambda learner: algorithm.parameters(learner).agent if kind is VdnConfig else learner.network.actor  # noqa: E731
+    learner = eqx.tree_at(lambda learner: where(learner).communication.loudness, learner, jnp.ones(3))
+
+    @jax.jit
+    def update(learner: Any) -> Any:
+        carry = rollout.start(env, params, memory, jax.random.key(0), 2)
+        policy = algorithm.policy(learner, True)
+        _, experience = rollout.collect(env, policy, memory, params, carry, jax.random.key(1), 4)
+        return algorithm.update(learner, experience, jax.random.key(2))
+
+    after, metrics = update(learner)
+    np.testing.assert_allclose(metrics["loss_messages"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(where(after).communication.loudness, 1 - 0.01, rtol=1e-4)

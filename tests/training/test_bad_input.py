@@ -29,9 +29,9 @@ from gacrl.config import files as configuration
 from gacrl.config.presets import PRESETS
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError
-from gacrl.evaluation.metrics import EPISODE_METRICS
 from gacrl.experiments import scoring
 from gacrl.experiments.paper import tables as paper_tables
+from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import build, checkpoint, session
 
 pytestmark = [
@@ -60,12 +60,12 @@ def traced_once() -> Iterator[None]:
     """What is searched is what reads: trainers are kept, scripted policies and pictures are not made."""
     with pytest.MonkeyPatch.context() as patch:
         references = {
-            name: dict.fromkeys(EPISODE_METRICS, float(k)) for k, name in enumerate(("random", "noop", "oracle"))
+            name: dict.fromkeys(METRICS, float(k)) for k, name in enumerate(("random", "noop", "oracle"))
         }
         patch.setattr(session, "make_trainer", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
-        patch.setattr(session.episodes, "record_many", lambda *_: [])
+        patch.setattr(session.episodes, "record_many", lambda *_, **__: [])
         patch.setattr(session.render, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])
         patch.setattr(paper_tables, "table_3", lambda *_: [])

@@ -61,7 +61,7 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     folder = tmp_path / "run"
     monkeypatch.setattr(build.build_algorithm, "make", lambda *_: breaking(at=5, loss=2.0))
     monkeypatch.setattr(session, "make_trainer", functools.cache(build.make_trainer))
-    monkeypatch.setattr(Trainer, "evaluate", lambda *_: {"return_agent_mean": np.zeros((1, 2))})
+    monkeypatch.setattr(Trainer, "evaluate", lambda self, *_: dict.fromkeys(self.table.names, np.zeros((1, 2))))
     with pytest.raises(Diverged) as stopped:
         session.start(SHORT, folder)
     assert str(stopped.value) == (

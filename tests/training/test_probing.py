@@ -5,7 +5,19 @@ from typing import Any
 
 import pytest
 
-from gacrl.config.algorithms import GacrlPaperConfig, IppoConfig, MappoConfig, NetworkConfig, PpoConfig, QmixConfig
+from gacrl.config.algorithms import (
+    CommnetConfig,
+    DialConfig,
+    GacrlPaperConfig,
+    IppoConfig,
+    IqlConfig,
+    MappoConfig,
+    NetworkConfig,
+    PpoConfig,
+    QLearningConfig,
+    QmixConfig,
+    VdnConfig,
+)
 from gacrl.doctor import BEYOND
 from gacrl.envs.probes import BEST_RETURN, PROBES
 from gacrl.training.probing import ProbeResult, probe_algorithm
@@ -46,11 +58,9 @@ def ppo(kind: type[PpoConfig], **network: Any) -> Any:
     return kind(network=settings, learning_rate=1e-2, update_epochs=4, num_minibatches=1)
 
 
-def q_learning(mixer: Any, **settings: Any) -> QmixConfig:
+def q_learning(kind: type[QLearningConfig], **settings: Any) -> Any:
     """Everything at random: the replay then shows every action in every place."""
-    return QmixConfig(
-        mixer=mixer,
-        mixer_width=8,
+    return kind(
         learning_rate=1e-2,
         learning_starts=0,
         replay_capacity=6_400,
@@ -66,11 +76,11 @@ DIAL = NetworkConfig(width=16, depth=1, communication="dial", vocabulary=2)
 BASELINES = {
     "mappo": (ppo(MappoConfig), 60),
     "ippo": (ppo(IppoConfig), 60),
-    "commnet": (ppo(IppoConfig, communication="commnet"), 60),
-    "qmix": (q_learning("qmix"), 100),
-    "vdn": (q_learning("vdn"), 100),
-    "iql": (q_learning("iql"), 100),
-    "dial": (q_learning("vdn", network=DIAL, sequence_length=2), 150),
+    "commnet": (ppo(CommnetConfig, communication="commnet"), 60),
+    "qmix": (q_learning(QmixConfig, mixer_width=8), 100),
+    "vdn": (q_learning(VdnConfig), 100),
+    "iql": (q_learning(IqlConfig), 100),
+    "dial": (q_learning(DialConfig, network=DIAL, sequence_length=2), 150),
 }
 SOLVED = {"commnet": ("message", "late_message"), "dial": ("late_message",)}
 """Of the probes that take a message: DIAL's is heard a step after it was said."""

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from gacrl import rollout
+from gacrl import rollout, tasks
 from gacrl.algorithms.contract import Algorithm
 from gacrl.config.presets import preset
 from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.envs.probes import Probe
 from gacrl.errors import UserError
+from gacrl.evaluation import references
 from gacrl.evaluation.episodes import record_many
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.tasks.spread import scripted
 from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import build, checkpoint
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import one_seed, without_padding
@@ -152,8 +153,7 @@ def test_a_seed_gives_the_same_bits_again_and_chunks_may_be_cut_anywhere(trainer
 # Episodes.
 
 E, T, LIMIT, UPDATES = 2, 3, 4, 8
-CLOSE = Spread(2, 2, max_cycles=LIMIT, reset_on_collision="truncate")
-CLOSE = replace(CLOSE, initial_params=CLOSE.initial_params._replace(reset_distance=0.7))
+CLOSE = Spread(2, 2, max_cycles=LIMIT, reset_on_collision="truncate", reset_distance=0.7)
 """Episodes end after four steps, or when the agents are close: now and then, and not in step with each other."""
 
 
@@ -204,7 +204,7 @@ class History(NamedTuple):
 @pytest.fixture(scope="module")
 def history(quick_start: dict[str, str]) -> History:
     """Seed 1."""
-    trainer = Trainer(remembering(CLOSE), CLOSE, constant(), E, T)
+    trainer = Trainer(remembering(CLOSE), CLOSE, constant(), E, T, metrics=METRICS)
     state, transitions, reports = trainer.init((1,)), [], []
     for _ in range(UPDATES):
         state, report = trainer.chunk(state, 1)
@@ -245,13 +245,13 @@ def test_episodes_are_counted_as_by_hand(history: History):
         ended = [metrics for t, metrics in episodes if update * T <= t < (update + 1) * T]
         assert report.episodes.ended == len(ended)
         assert report.metrics == {"loss": 2.0}
-        for k, name in enumerate(trainer.metric_names):
+        for k, name in enumerate(trainer.table.names):
             values = np.array([metrics[name] for metrics in ended])
             np.testing.assert_allclose(report.episodes.total[k], values.sum(), rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(report.episodes.squares[k], np.square(values).sum(), rtol=1e-5, atol=1e-6)
             if len(values):
                 np.testing.assert_allclose(report.episodes.last[k], values[-1], rtol=1e-5, atol=1e-6)
-    assert set(trainer.metric_names) == set(episodes[0][1])
+    assert set(trainer.table.names) == set(episodes[0][1])
 
 
 def test_a_long_chunk_counts_what_short_ones_do(history: History):
@@ -323,17 +323,19 @@ def test_evaluation_does_not_depend_on_what_was_trained_before(trainers: dict[in
 
 def test_every_policy_is_evaluated_from_the_same_starts(trainers: dict[int, Trainer]):
     trainer = trainers[2]
-    env, key = build.evaluation_env(SMALL), stream_key("monitor")
-    params = env.default_params()
-    noop, nothing = scripted.make("noop", env)
+    env, key = trainer.evaluation_env, stream_key("monitor")
+    params = trainer.evaluation_params
+    noop, nothing = references.noop(env)
     learner = one_seed(trainer.init((3, 4)).learner, 1)
-    played = record_many(env, trainer.algorithm.policy(learner, True), trainer.memory, params, key, 4)
-    idle = record_many(env, noop, nothing, params, key, 4)
+    look = references.look_of(tasks.find("spread"), SMALL.env)
+    policy = trainer.algorithm.policy(learner, True)
+    played = record_many(env, policy, trainer.memory, params, key, 4, look=look)
+    idle = record_many(env, noop, nothing, params, key, 4, look=look)
     for one, other in zip(played, idle, strict=True):
-        np.testing.assert_array_equal(one.positions[0], other.positions[0])
-        np.testing.assert_array_equal(one.landmarks[0], other.landmarks[0])
-        assert (one.positions[-1] != other.positions[-1]).any()
-    assert len({episode.positions[0].tobytes() for episode in idle}) == 4
+        np.testing.assert_array_equal(one.scene.agents.positions[0], other.scene.agents.positions[0])
+        np.testing.assert_array_equal(one.scene.marks.positions[0], other.scene.marks.positions[0])
+        assert (one.scene.agents.positions[-1] != other.scene.agents.positions[-1]).any()
+    assert len({episode.scene.agents.positions[0].tobytes() for episode in idle}) == 4
 
     # What the recordings show is what is measured.
     measured = jax.jit(lambda: evaluate(env, noop, nothing, params, key, 4))()["return_agent_mean"]
@@ -368,7 +370,7 @@ def test_a_run_that_diverges_says_so(monkeypatch: pytest.MonkeyPatch):
         training=TrainingConfig(env_steps=E * T, num_envs=E, num_steps=T),
         evaluation=EvaluationConfig(num_episodes=1),
     )
-    trainer = Trainer(algorithm, CLOSE, constant(), E, T)
+    trainer = Trainer(algorithm, CLOSE, constant(), E, T, metrics=METRICS)
     monkeypatch.setattr(trainer, "evaluate", lambda *how: {"return_agent_mean": np.zeros((1, 1))})
     with pytest.raises(
         UserError, match=r"seed 0 diverged between environment steps 0 and 6: loss is nan; .*smaller learning"

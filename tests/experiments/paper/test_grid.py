@@ -58,7 +58,7 @@ def test_it_goes_on_with_what_is_missing_and_its_numbers_are_those_of_single_run
     algorithm = replace(config.algorithm, learning_rate=0.1, temperature=2.5)
     trainer = build.make_trainer(replace(config, algorithm=algorithm))
     _, report = trainer.chunk(trainer.init((seed,)), 20)
-    alone = float(report.episodes.total[0, trainer.metric_names.index("reward_shaped")]) / 4
+    alone = float(report.episodes.total[0, trainer.table.names.index("reward_shaped")]) / 4
     results = tmp_path / "out" / "results.jsonl"
     scores = {
         Member(Point(row["learning_rate"], row["epsilon"], row["temperature"]), row["seed"]): row["reward_shaped"]

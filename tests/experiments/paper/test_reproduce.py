@@ -15,8 +15,7 @@ from gacrl.algorithms.actions import choices
 from gacrl.cli.main import main
 from gacrl.config import presets
 from gacrl.config.presets import GACRL_PARAMETERS
-from gacrl.config.run import CurriculumConfig, EnvConfig
-from gacrl.evaluation.metrics import EPISODE_METRICS
+from gacrl.config.run import CurriculumConfig
 from gacrl.experiments.paper import claims as claim_data
 from gacrl.experiments.paper import reproduce
 from gacrl.experiments.paper import tables as paper_tables
@@ -27,6 +26,7 @@ from gacrl.experiments.paper.reproduce import at_paper_budget, plan
 from gacrl.experiments.paper.verdicts import judge, judge_all
 from gacrl.experiments.study import DIVERGED, Planned
 from gacrl.networks.agent import acting_parameters, matched
+from gacrl.tasks.spread.settings import METRICS, SpreadSettings
 from gacrl.training.recorder import RunFolder
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
@@ -45,7 +45,7 @@ ORACLE = {"reward_shaped": (34.0, 2.0), "reward_raw": (-0.13, 0.05), "distance_a
 
 def levels(base: Mapping[str, tuple[float, float]] = RANDOM) -> dict[str, tuple[float, float]]:
     """(mean, standard deviation of an episode) of every metric."""
-    return {**dict.fromkeys(EPISODE_METRICS, (0.1, 0.05)), **RANDOM, **base}
+    return {**dict.fromkeys(METRICS, (0.1, 0.05)), **RANDOM, **base}
 
 
 def series(shift: Mapping[str, float] | None = None, preset: str = "paper") -> Series:
@@ -303,7 +303,7 @@ def test_the_claims_are_sound_data():
             assert reading.describe() != Reading().describe()
             if reading.swap:
                 assert set(reading.swap) <= set(measures())
-    assert {name for measure in measures().values() for name in measure.weights} <= set(EPISODE_METRICS)
+    assert {name for measure in measures().values() for name in measure.weights} <= set(METRICS)
     assert all(entry["setting"] and entry["place"] for entry in claim_data.untrained())
     verdicts = {judged.claim.id: judged.base.verdict for judged in judge_all(made_up())}
     assert verdicts["table-3-gacrl"] == "cannot be told apart from random"
@@ -321,8 +321,8 @@ def test_every_run_has_the_papers_steps_and_logs_each_50_episodes(tmp_path: Path
         assert config.num_updates * config.steps_per_update == 112_500
         assert config.updates_per_chunk * config.steps_per_update == 3_750
         assert (config.env.max_cycles, config.num_seeds) == (75, 5)
-        paper = presets.preset("paper")
-        assert (config.curriculum == paper.curriculum) == (config.env.reward == "paper") == (column == "paper")
+        moves = config.env.local_ratio_end is not None and config.env.coverage_threshold_end is not None
+        assert moves == (config.env == presets.preset("paper").env) == (column == "paper")
     gacrl = {run.config.algorithm for (_, who), run in runs.items() if who == "GACRL"}
     assert gacrl == {presets.preset("paper").algorithm}
 
@@ -336,13 +336,13 @@ def test_the_extended_runs_differ_by_the_algorithm_alone(tmp_path: Path):
     for config in runs.values():
         algorithm: Any = config.algorithm
         assert (config.env, config.curriculum, config.seeds) == (
-            EnvConfig(reward="coverage"),
+            SpreadSettings(reward="coverage"),
             CurriculumConfig(),
             (0, 1, 2, 3, 4),
         )
         assert config.num_updates * config.steps_per_update == 150_000
         assert (algorithm.network.torso, algorithm.augment, algorithm.symmetric_play) == ("graph", True, True)
-        env = tasks.make(config.env)
+        env = tasks.find(config.task).make(config.env)
         num_actions = choices(env).size
         sizes.append(acting_parameters(env, matched(env, algorithm.network, num_actions), num_actions))
     assert sizes[0] == GACRL_PARAMETERS

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gacrl.config import presets
-from gacrl.config.run import EnvConfig
-from gacrl.tasks.spread.environment import Spread
+from gacrl.tasks.spread.environment import Spread, params_of
 from gacrl.tasks.spread.potential import assignment_potential
+from gacrl.tasks.spread.settings import SpreadSettings
 from gacrl.training import build
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -46,8 +46,7 @@ def test_an_episode_pays_back_what_it_was_lent(terminates):
     """Discounted and summed, what is added to MPE2's reward is γᵀ Φ(s_T) − Φ(s_0), or −Φ(s_0) where the task is over."""
     gamma = 0.9
     shaped = Spread(2, 2, max_cycles=30, reward="potential", terminate_on_success=terminates)
-    shaped = replace(shaped, initial_params=shaped.initial_params._replace(potential_discount=gamma))
-    plain, params = replace(shaped, reward="mpe2"), shaped.default_params()
+    plain, params = replace(shaped, reward="mpe2"), params_of(shaped, gamma)
     step, bare = jax.jit(shaped.step), jax.jit(plain.step)
     state, _ = shaped.reset(jax.random.key(4))
     if terminates:  # a step from both landmarks, at rest
@@ -82,5 +81,6 @@ def test_many_copies_are_shaped_like_one():
 
 
 def test_training_takes_the_learners_discount():
-    config = replace(presets.preset("gacrl"), env=EnvConfig(reward="potential"))
-    assert build.make_trainer(config).env.initial_params.potential_discount == config.algorithm.gamma
+    config = replace(presets.preset("gacrl"), env=SpreadSettings(reward="potential"))
+    found = build.make_trainer(config).params.potential_discount
+    np.testing.assert_array_equal(found, np.float32(config.algorithm.gamma))

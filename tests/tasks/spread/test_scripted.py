@@ -11,15 +11,24 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist, pdist
 
 from gacrl import tasks
-from gacrl.config.run import EnvConfig
 from gacrl.envs.particles import Physics
+from gacrl.errors import ConfigError
+from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import evaluate
 from gacrl.tasks.spread import scripted
-from gacrl.tasks.spread.environment import Spread, SpreadParams, SpreadState, pack_state, unpack_state
-from gacrl.types import Channel, Decision
+from gacrl.tasks.spread.environment import Spread, SpreadState, pack_state, unpack_state
+from gacrl.tasks.spread.settings import METRICS, SpreadSettings
+from gacrl.tasks.spread.task import TASK
+from gacrl.types import Actor, Channel, Decision
 
 KEY = jax.random.key(7)
 QUIET = Channel()
+SCRIPTED = ("random", "noop", "oracle")
+"""Stand beside every number."""
+
+
+def scripted_actor(name: str, env: Spread) -> Actor:
+    return references.actor(TASK, name, env)
 
 
 def at_rest(positions, landmarks) -> SpreadState:
@@ -40,7 +49,7 @@ def starts(num_envs: int, num_agents: int, num_landmarks: int, arena_scale: floa
 
 def play_on(env: Spread, positions, landmarks, num_steps: int, name: str = "oracle") -> np.ndarray:
     """Where a scripted policy brings the agents that start at rest: [E N 2]."""
-    actor = scripted.make(name, env)
+    actor = scripted_actor(name, env)
 
     def play(positions, landmarks):
         def step(loop, _):
@@ -62,8 +71,12 @@ def covered(positions: np.ndarray, landmarks: np.ndarray) -> float:
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(ValueError, match="no scripted policy 'orcale', only random, noop, oracle, local"):
-        scripted.make("orcale", Spread())
+    assert references.shown(TASK) == list(SCRIPTED)
+    assert references.playable(TASK) == [*SCRIPTED, "local"]
+    with pytest.raises(ConfigError, match="unknown scripted policy 'orcale': did you mean 'oracle'"):
+        scripted_actor("orcale", Spread())
+    with pytest.raises(ConfigError, match="known: local, noop, oracle, random"):
+        scripted_actor("xyz", Spread())
 
 
 # Three agents, 25 steps
@@ -73,7 +86,7 @@ def test_an_unknown_name_is_refused():
 def player():
     """One compiled program for the three policies: (name's index, landmark speed, share of it seen) -> metrics."""
     env = Spread()
-    policies = [scripted.make(name, env) for name in scripted.SCRIPTED]
+    policies = [scripted_actor(name, env) for name in SCRIPTED]
     memories = tuple(policy.initial_memory for policy in policies)
 
     @jax.jit
@@ -87,10 +100,10 @@ def player():
             return Decision(action), tuple(memory for _, memory in decided)
 
         params = env.default_params()._replace(landmark_speed=landmark_speed)
-        return evaluate(env, policy, memories, params, KEY, 2048)
+        return evaluate(env, policy, memories, params, KEY, 2048, metrics=METRICS)
 
     def by_name(name, landmark_speed=0.0, seen_share=1.0):
-        metrics = play(scripted.SCRIPTED.index(name), landmark_speed, seen_share)
+        metrics = play(SCRIPTED.index(name), landmark_speed, seen_share)
         return {name: np.asarray(values, np.float64) for name, values in metrics.items()}
 
     return by_name
@@ -127,7 +140,7 @@ def test_oracle_with_continuous_actions():
 
 def test_floors_with_continuous_actions():
     env = Spread(continuous_actions=True)
-    random, noop = scripted.make("random", env).policy, scripted.make("noop", env).policy
+    random, noop = references.random(env).policy, references.noop(env).policy
     observation = jax.jit(functools.partial(observe, env))(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
     np.testing.assert_array_equal(noop((), observation, KEY, QUIET)[0].action, np.zeros((3, 5)))
     pushes = random((), observation, KEY, QUIET)[0].action
@@ -165,7 +178,7 @@ def test_landmarks_closer_than_two_discs():
 def test_the_assignment_is_optimal_and_kept(num_agents, num_landmarks):
     # The agents see little, which is nothing to the oracle.
     env = Spread(num_agents, num_landmarks, num_agent_neighbors=1, num_landmark_neighbors=1)
-    oracle = scripted.make("oracle", env)
+    oracle = scripted.oracle(env)
 
     @jax.jit
     @jax.vmap
@@ -183,25 +196,26 @@ def test_the_assignment_is_optimal_and_kept(num_agents, num_landmarks):
 
 
 def test_padding_changes_nothing():
-    def decide(env: Spread, positions, landmarks):
-        oracle = scripted.make("oracle", env)
+    def decide(env: Spread, positions, landmarks, **masks):
+        oracle, params = scripted.oracle(env), env.default_params()._replace(**masks)
 
         def act(positions, landmarks):
-            return oracle.policy(oracle.initial_memory, observe(env, positions, landmarks), KEY, QUIET)
+            seen = env.observe(at_rest(positions, landmarks), params)
+            return oracle.policy(oracle.initial_memory, seen, KEY, QUIET)
 
         return jax.jit(jax.vmap(act))(positions, landmarks)
 
     positions, landmarks = starts(200, 4, 4)
-    masks = SpreadParams(agent_mask=jnp.arange(4) < 2, landmark_mask=jnp.arange(4) < 3)
+    masks = {"agent_mask": jnp.arange(4) < 2, "landmark_mask": jnp.arange(4) < 3}
     decision, memory = decide(Spread(2, 3), positions[:, :2], landmarks[:, :3])
-    padded_decision, padded_memory = decide(Spread(4, 4, initial_params=masks), positions, landmarks)
+    padded_decision, padded_memory = decide(Spread(4, 4), positions, landmarks, **masks)
     np.testing.assert_array_equal(padded_memory[:, :2], memory)
     np.testing.assert_array_equal(padded_decision.action[:, :2], decision.action)
 
 
 def test_large_teams_pay_for_the_assignment_once():
     env = Spread(200, 200)
-    oracle = scripted.make("oracle", env)
+    oracle = scripted.oracle(env)
     places = starts(2, 200, 200, arena_scale=8.0)
     observations = jax.jit(jax.vmap(functools.partial(observe, env)))(*places)
     act = jax.jit(jax.vmap(lambda memory, observation: oracle.policy(memory, observation, KEY, QUIET)[1]))
@@ -237,7 +251,7 @@ def test_the_local_policy_leaves_a_landmark_to_who_is_nearer():
 
 
 def test_the_local_policy_lies_between_random_and_the_oracle():
-    env = tasks.make(EnvConfig(num_agents=10, arena_scale=(10 / 3) ** 0.5))
+    env = tasks.find("spread").make(SpreadSettings(num_agents=10, arena_scale=(10 / 3) ** 0.5))
     positions, landmarks = starts(300, 10, 10, (10 / 3) ** 0.5)
     ends = {
         name: covered(play_on(env, positions, landmarks, 60, name), landmarks)

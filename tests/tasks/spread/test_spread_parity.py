@@ -17,7 +17,7 @@ from jax import lax
 from mpe2 import simple_spread_v3
 
 from gacrl.envs.particles import Physics
-from gacrl.tasks.spread.environment import Spread, SpreadParams, SpreadState
+from gacrl.tasks.spread.environment import Spread, SpreadState
 
 TEAMS = {1: 45, 2: 45, 3: 45, 5: 45, 10: 30}
 """Episodes of each team size, for each kind of action: 420 in all."""
@@ -152,7 +152,8 @@ def step_from(env: Spread, steps: Steps, **changed: Any):
     """Our step from each recorded state: one compiled call for all of them."""
 
     def step(state, action, local_ratio):
-        params = env.default_params()._replace(local_ratio=local_ratio, **changed)
+        numbers = jax.tree.map(lambda number: jax.numpy.asarray(number, float), changed)
+        params = env.default_params()._replace(local_ratio=local_ratio, **numbers)
         return env.step(state, action, jax.random.key(0), params)
 
     given = jax.tree.map(jax.numpy.asarray, (recorded_state(steps), steps.action, steps.local_ratio))
@@ -299,9 +300,9 @@ def test_other_constants_in_mpe2s_world():
             agent.size, agent.accel = physics.agent_radius, physics.action_force
 
     steps = record(3, True, 9, change_world=set_constants)
-    env = Spread(3, 3, continuous_actions=True, initial_params=SpreadParams(physics=physics))
+    env = Spread(3, 3, continuous_actions=True)
     with jax.enable_x64(True):
-        state, result = step_from(env, steps)
+        state, result = step_from(env, steps, physics=physics)
     assert_equals_mpe2(steps, state, result)
 
 
