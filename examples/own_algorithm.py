@@ -41,11 +41,11 @@ def make(config, env, training, progress=None):
         return Learner(network, adam.init(network))
 
     def policy(learner, explore):
-        def act(memory, observation, key, channel):
-            output, memory = learner.network(observation, memory, key if explore else None, channel)
+        def act(memory, observation, key):
+            output, memory = learner.network(observation, memory, key if explore else None)
             logits = log_policy(output.head, observation.action_mask)
             choice = jax.random.categorical(key, logits) if explore else logits.argmax(-1)
-            return Decision(choice, output.message, output.adjacency, {"key": key}), memory
+            return Decision(choice, output.messages, output.adjacency, {"key": key}), memory
 
         return act
 

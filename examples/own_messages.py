@@ -23,17 +23,17 @@ class Numbers(Communication):
     hear_them: Linear
     price: float = eqx.field(static=True)
 
-    def __init__(self, config, key, gain=None):
+    def __init__(self, env, config, key, gain=None):
         say_key, hear_key = jax.random.split(key)
         self.say = Linear(config.width, config.vocabulary, say_key, gain)
         self.hear_them = Linear(config.vocabulary, config.width, hear_key, gain)
         self.price = 1e-3
 
-    def speak(self, hidden, near, channel, key, temperature, code=None):
+    def speak(self, hidden, near, key, temperature, code=None):
         numbers = jnp.tanh(self.say(hidden))  # [N V]
-        heard = neighbour_mean(received(numbers, channel, key), near.adjacency)
+        heard = neighbour_mean(received(numbers, near), near.adjacency)
         cost = self.price * jnp.square(numbers).sum(-1)
-        return Spoken(hidden + jax.nn.relu(self.hear_them(heard)), numbers, loss=cost)
+        return Spoken(hidden + jax.nn.relu(self.hear_them(heard)), numbers[None], loss=cost)
 
 
 COMMUNICATION["numbers"] = Numbers

@@ -16,7 +16,7 @@ from gacrl.config.algorithms import AlgorithmConfig, GacrlConfig, GacrlPaperConf
 from gacrl.envs.probes import BEST_RETURN
 from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.networks.communication import hears_late
+from gacrl.networks.communication import kind_of
 from gacrl.training.probing import probe_algorithm
 from gacrl.versions import versions
 
@@ -104,7 +104,7 @@ def _learns(preset: str, asked: Trial) -> Iterator[Finding]:
     For agents that hear a step later what is said, the late probe of messages is theirs.
     """
     network = getattr(asked.algorithm, "network", None)
-    late = network is not None and hears_late(network)
+    late = network is not None and kind_of(network).heard_late
     probes = ("action", "both", "late_message" if late else "message")
     result = probe_algorithm(*asked, probes=probes)
     for probe in probes:

@@ -25,7 +25,7 @@ from gacrl.training.keeper import Acting
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Parent
 from gacrl.training.trainer import Trainer
-from gacrl.types import Channel, Memory, Policy
+from gacrl.types import Memory, Policy
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,8 @@ class LoadedPolicy:
         self.env = env
         self._initial_memory = initial_memory
         self._act = {greedy: jax.jit(policy) for greedy, policy in policies.items()}
-        self.message: np.ndarray | None = None
-        """What each agent sent at the last step, [N, V]; None where the policy sends nothing."""
+        self.messages: np.ndarray | None = None
+        """What each agent sent in each round of the last step, [R, N, V]; None where the policy says nothing."""
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -187,8 +187,8 @@ class LoadedPolicy:
             raise ValueError(f"observations must be [agents, numbers] = {expected}, not {observations.shape}")
         self._key, key = jax.random.split(self._key)
         seen = self.env.from_features(observations)
-        decision, self._memory = self._act[greedy](self._memory, seen, key, Channel())
-        self.message = None if decision.message is None else np.asarray(decision.message)
+        decision, self._memory = self._act[greedy](self._memory, seen, key)
+        self.messages = None if decision.messages is None else np.asarray(decision.messages)
         return np.asarray(decision.action)
 
 

@@ -243,7 +243,7 @@ class _Picture:
         kinds = {"agent": self._words.agent}
         kinds |= {"mark": self._words.mark, "lit": self._words.lit} if marks else {}
         kinds |= {} if self.episode.adjacency is None else {"edge": "can hear"}
-        kinds |= {} if self._symbols is None else {"message": "message"}
+        kinds |= {} if self._symbols is None or (self._symbols < 0).all() else {"message": "message"}
         words = list(kinds.values())
         icon = px(20)
         widths = [icon + px(5) + small.getlength(word) for word in words]
@@ -266,7 +266,7 @@ class _Picture:
         elif kind == "edge":
             pen.edge((0.0, side * 0.75), (side, side * 0.25), 120)
         elif kind == "message":
-            pen.bubble((side * 0.1, side * 0.95), side * 0.36, 0, side * 0.45)
+            pen.bubbles((side * 0.1, side * 0.95), side * 0.36, [0], side * 0.45)
         else:
             pen.landmark(middle, side * 0.36, kind == "lit")
             pen.ring(middle, side * 0.36, kind == "lit")
@@ -298,8 +298,7 @@ class _Picture:
         if self._symbols is not None:
             spoken = self._symbols[self._now(t)]
             for i in seen:
-                if spoken[i] >= 0:
-                    pen.bubble(discs[i], sizes[i], int(spoken[i]))
+                pen.bubbles(discs[i], sizes[i], [symbol for symbol in spoken[:, i].tolist() if symbol >= 0])
         return image.reduce(_SUPERSAMPLING)
 
     def _now(self, t: int) -> int:
@@ -380,22 +379,26 @@ class _Pen:
         size = max(radius * (0.85 if len(text) < 2 else 0.7), 7 * self._unit)
         self._draw.text(point, text, _INK, _font(round(size), True), "mm")
 
-    def bubble(self, speaker: _Point, radius: float, symbol: int, size: float | None = None) -> None:
-        """A speech bubble at the upper right of a disc, with the symbol's letter and colour."""
+    def bubbles(self, speaker: _Point, radius: float, symbols: Sequence[int], size: float | None = None) -> None:
+        """Draw speech bubbles at the upper right of a disc: a symbol's letter and colour for each round."""
+        if not symbols:
+            return
         size = max(radius * 0.42, 6.5 * self._unit) if size is None else size
-        colour = SYMBOL_COLOURS[symbol % len(SYMBOL_COLOURS)]
-        angle = -math.pi / 4
-        point = _towards(speaker, angle, radius + size * 0.75)
-        rim = self._width(1.2)
+        angle, rim = -math.pi / 4, self._width(1.2)
+        x, y = point = _towards(speaker, angle, radius + size * 0.75)
         tail = [_towards(speaker, angle, radius * 0.7)]
         tail += [_towards(point, angle + turn, size * 0.8) for turn in (2.2, -2.2)]
         self._draw.polygon(tail, _PAPER, _PAPER, 2 * rim)
-        self._circle(point, size + rim, fill=_PAPER)
-        self._draw.polygon(tail, colour)
-        self._circle(point, size, fill=colour)
-        letter = chr(ord("A") + symbol % 26) + (str(symbol // 26) if symbol >= 26 else "")
-        font = _font(round(size * (1.35 if len(letter) < 2 else 0.95)), True)
-        self._draw.text(point, letter, _readable_on(colour), font, "mm")
+        places = [(x + 1.8 * size * number, y) for number in range(len(symbols))]
+        for place in places:
+            self._circle(place, size + rim, fill=_PAPER)
+        self._draw.polygon(tail, SYMBOL_COLOURS[symbols[0] % len(SYMBOL_COLOURS)])
+        for place, symbol in zip(places, symbols, strict=True):
+            colour = SYMBOL_COLOURS[symbol % len(SYMBOL_COLOURS)]
+            self._circle(place, size, fill=colour)
+            letter = chr(ord("A") + symbol % 26) + (str(symbol // 26) if symbol >= 26 else "")
+            font = _font(round(size * (1.35 if len(letter) < 2 else 0.95)), True)
+            self._draw.text(place, letter, _readable_on(colour), font, "mm")
 
     def _circle(
         self,

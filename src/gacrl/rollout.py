@@ -1,6 +1,7 @@
 """Agents acting in environments: the one step that training and evaluation share."""
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,20 @@ from jaxtyping import Array, Bool, Key
 
 from gacrl.envs import copies
 from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
+from gacrl.errors import ConfigError
 from gacrl.networks.memory import restarted
-from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Rollout, Transition
+from gacrl.types import (
+    Arrives,
+    Decision,
+    Intervention,
+    Memory,
+    Observation,
+    Policy,
+    PRNGKey,
+    Rollout,
+    Transition,
+    Words,
+)
 
 
 class Carry(NamedTuple):
@@ -20,13 +33,48 @@ class Carry(NamedTuple):
     memory: Memory
     first: Bool[Array, " E"]
     """An episode opens with the next step."""
+    intervention: Any = ()
+    """What an intervention carries."""
 
 
-def start(env: Environment, params: EnvParams, memory: Memory, key: PRNGKey, num_envs: int) -> Carry:
-    """E fresh episodes. memory: the policy's initial memory for one environment."""
+def start(
+    env: Environment,
+    params: EnvParams,
+    memory: Memory,
+    key: PRNGKey,
+    num_envs: int,
+    intervention: Intervention | None = None,
+    policy: Policy | None = None,
+) -> Carry:
+    """Begin E fresh episodes. memory: the policy's initial memory for one environment.
+
+    An intervention needs the policy whose words it catches. Raises ConfigError where that says nothing.
+    """
     env_state, observation = copies.reset(env, params, jax.random.split(key, num_envs))
     memories = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), memory)
-    return Carry(env_state, observation, memories, jnp.ones(num_envs, bool))
+    carry = Carry(env_state, observation, memories, jnp.ones(num_envs, bool))
+    if intervention is None:
+        return carry
+    if policy is None:
+        raise ValueError("an intervention catches the words of a policy: which one?")
+    words = jax.eval_shape(partial(say, policy, carry, jax.random.split(key, num_envs)), Arrives())
+    return carry._replace(intervention=intervention.init(words))
+
+
+def say(policy: Policy, carry: Carry, keys: Key[Array, " E"], arrives: Arrives) -> Words:
+    """Ask the agents of all environments what they say in this step if this arrives.
+
+    Raises ConfigError where the policy says nothing.
+    """
+    listening = carry.observation._replace(arrives=arrives)
+    return spoken(jax.vmap(policy)(carry.memory, listening, keys)[0])
+
+
+def spoken(decision: Decision) -> Words:
+    """Return what was said. Raises ConfigError where the policy says nothing."""
+    if decision.messages is None:
+        raise ConfigError("the agents say nothing: there are no messages to intervene in")
+    return decision.messages
 
 
 def act(
@@ -35,25 +83,31 @@ def act(
     params: EnvParams,
     carry: Carry,
     keys: Key[Array, "E 3"],
-    channel: Channel | None = None,
-) -> tuple[EnvState, Memory, Transition]:
-    """Every environment takes one step, and none is reset: its state, the policy's memory, and what happened."""
-    channel = Channel() if channel is None else channel
-    decision, memory = jax.vmap(policy, (0, 0, 0, None))(carry.memory, carry.observation, keys[:, 0], channel)
+    intervention: Intervention | None = None,
+) -> tuple[Carry, Transition]:
+    """Let every environment take one step, and reset none: where they stand then, and what happened."""
+    observation, carried = carry.observation, carry.intervention
+    if intervention is not None:
+        ask, key = partial(say, policy, carry, keys[:, 0]), jax.random.fold_in(keys[0, 2], 1)
+        observation = observation._replace(arrives=intervention.arrives(carried, ask, carry.first, key))
+    decision, memory = jax.vmap(policy)(carry.memory, observation, keys[:, 0])
     step_mapped = jax.vmap(env.step, (0, 0, 0, None))  # and not `step_many`: docs/design.md
     env_state, after = step_mapped(carry.env_state, decision.action, keys[:, 1], params)
+    if intervention is not None:
+        carried = intervention.follow(carried, spoken(decision), carry.first)
     transition = Transition(
-        observation=carry.observation,
+        observation=observation,
         decision=decision,
         reward=after.reward,
         terminated=after.terminated,
         truncated=after.truncated,
         first=carry.first,
-        next_observation=after.observation,
+        next_observation=after.observation._replace(arrives=observation.arrives),
         info=measured(after),
         left=after.left,
     )
-    return env_state, memory, transition
+    over = after.terminated | after.truncated
+    return Carry(env_state, after.observation, memory, over, carried), transition
 
 
 def measured(after: TimeStep) -> dict[str, Array]:
@@ -70,21 +124,18 @@ def renew(
     env: Environment,
     initial_memory: Memory,
     params: EnvParams,
-    env_state: EnvState,
-    memory: Memory,
-    transition: Transition,
+    carry: Carry,
+    left: Bool[Array, "E N"] | None,
     keys: Key[Array, "E 3"],
 ) -> Carry:
     """Reset those whose episode has ended, with fresh memory; whose life has ended inside one forgets."""
-    over = transition.terminated | transition.truncated
     env_state, observation = copies.begin_anew(
-        env, params, env_state, over, transition.next_observation, lambda: keys[:, 2]
+        env, params, carry.env_state, carry.first, carry.observation, lambda: keys[:, 2]
     )
-    done = transition.terminated | transition.truncated
-    memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, done)
-    if transition.left is not None:
-        memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, transition.left)
-    return Carry(env_state, observation, memory, done)
+    memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, carry.memory, carry.first)
+    if left is not None:
+        memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, left)
+    return carry._replace(env_state=env_state, observation=observation, memory=memory)
 
 
 def step(
@@ -94,12 +145,12 @@ def step(
     params: EnvParams,
     carry: Carry,
     key: PRNGKey,
-    channel: Channel | None = None,
+    intervention: Intervention | None = None,
 ) -> tuple[Carry, Transition]:
-    """Every environment takes one step; those whose episode ended are reset, with fresh memory."""
+    """Let every environment take one step; those whose episode ended are reset, with fresh memory."""
     keys = jax.random.split(key, (carry.first.shape[0], 3))
-    env_state, memory, transition = act(env, policy, params, carry, keys, channel)
-    return renew(env, initial_memory, params, env_state, memory, transition, keys), transition
+    after, transition = act(env, policy, params, carry, keys, intervention)
+    return renew(env, initial_memory, params, after, transition.left, keys), transition
 
 
 def collect(
@@ -110,14 +161,19 @@ def collect(
     carry: Carry,
     key: PRNGKey,
     num_steps: int,
+    intervention: Intervention | None = None,
 ) -> tuple[Carry, Rollout]:
-    """T steps of E environments: transitions [T, E, …]."""
+    """Take T steps of E environments: transitions [T, E, …]."""
+
+    def one_step(carry: Carry, key: PRNGKey) -> tuple[Carry, Transition]:
+        return step(env, policy, initial_memory, params, carry, key, intervention)
+
     if num_steps == 1:  # no loop around a single step
-        after, transition = step(env, policy, initial_memory, params, carry, key)
+        after, transition = one_step(carry, key)
         transitions = jax.tree.map(lambda leaf: leaf[None], transition)
     else:
         after, transitions = jax.lax.scan(
-            lambda carry, key: step(env, policy, initial_memory, params, carry, key),
+            one_step,
             carry,
             jax.random.split(key, num_steps),
         )

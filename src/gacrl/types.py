@@ -1,7 +1,7 @@
 """The containers that pass between the rooms of the house, and the letters of their axes.
 
     E environments   T time   N agents   L landmarks   O observation   S global state
-    Z latent   H hidden   V message symbols   A actions   B batch   M metrics
+    Z latent   H hidden   V message symbols   R rounds of messages   A actions   B batch   M metrics
 
 A container is written for one environment at one step; `rollout` puts [T, E] in front of every axis.
 """
@@ -18,6 +18,21 @@ Memory: TypeAlias = Any
 Its arrays have the agents in front; a scalar belongs to the whole team."""
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Named scalars of one step or one update."""
+
+
+class Arrives(NamedTuple):
+    """What reaches the listeners of a step, where that is not what was said. Empty, the default: all arrives as sent.
+
+    One primitive for everything that can happen to messages: silence, loss, delay, noise, other agents' words, words of
+    another episode, of another program or of a human. Losses hear what was heard when the agents acted.
+    """
+
+    values: Float[Array, "*b R N V"] | None = None
+    """What arrives of agent j in round r, to everyone who hears j, where `replaced` says so."""
+    replaced: Bool[Array, "*b R N"] | None = None
+    """Whose words of which round are replaced; None with values: all are."""
+    kept: Bool[Array, "*b N N"] | None = None
+    """Entry [i, j]: i still hears j. A cut edge counts nowhere, neither in attention nor in means."""
 
 
 class Observation(NamedTuple):
@@ -37,6 +52,8 @@ class Observation(NamedTuple):
     """A graph that the task itself prescribes; None leaves it to the algorithm."""
     state: Float[Array, "*b S"] | None = None
     """The global state for central critics; None means the agents' features side by side."""
+    arrives: Arrives = Arrives()
+    """What reaches the agents of what is said in this step; the rollout fills it where somebody intervenes."""
 
 
 class Entities(NamedTuple):
@@ -65,8 +82,8 @@ class Decision(NamedTuple):
     """What the agents of one environment do, and how they came to it."""
 
     action: Int[Array, "*b N"] | Float[Array, "*b N A"]
-    message: Float[Array, "*b N V"] | None = None
-    """What each agent sent; rows of a padded agent are 0."""
+    messages: Float[Array, "*b R N V"] | None = None
+    """What each agent sent in each round; rows of an absent agent are 0. None for a policy that says nothing."""
     adjacency: Bool[Array, "*b N N"] | None = None
     """Entry [i, j]: j's message reaches i."""
     extras: Any = ()
@@ -102,24 +119,8 @@ class Rollout(NamedTuple):
     last_memory: Memory
 
 
-class Channel(NamedTuple):
-    """What happens to messages on their way. None, the default everywhere, leaves them as they were sent.
-
-    The same mechanism silences, delays, scrambles and translates, in training, analysis and viewer.
-    """
-
-    edge_keep: Float[Array, "N N"] | None = None
-    """Entry [i, j]: 1 lets j's messages reach i, 0 silences them."""
-    symbol_map: Float[Array, "N V V"] | None = None
-    """Entry [j, v]: the distribution over symbols that j's symbol v arrives as."""
-    delay: Int[Array, ""] | None = None
-    """Steps that a message is under way; needs a policy memory made by `networks.messages.mailbox`."""
-    noise: Float[Array, ""] | None = None
-    """Probability that a message is replaced by a random symbol."""
-
-
-Policy: TypeAlias = Callable[[Memory, Observation, PRNGKey, Channel], tuple[Decision, Memory]]
-"""(memory, observation, key, channel) -> (decision, memory), for one environment. Everything that acts uses it."""
+Policy: TypeAlias = Callable[[Memory, Observation, PRNGKey], tuple[Decision, Memory]]
+"""(memory, observation, key) -> (decision, memory), for one environment. Everything that acts uses it."""
 
 
 class Actor(NamedTuple):
@@ -127,6 +128,23 @@ class Actor(NamedTuple):
 
     policy: Policy
     initial_memory: Memory
+
+
+Words: TypeAlias = Float[Array, "E R N V"]
+"""What the agents of E environments say in the R rounds of a step."""
+
+
+class Intervention(NamedTuple):
+    """What somebody does to the messages of E environments side by side; `gacrl.messages.interventions` has them."""
+
+    name: str
+    arrives: Callable[[Any, Callable[[Arrives], Words], Bool[Array, " E"], PRNGKey], Arrives]
+    """(state, say, first, key) -> what arrives in this step. `say` asks the agents what they say if this arrives;
+    `first` marks environments that begin an episode."""
+    init: Callable[[Words], Any] = lambda words: ()
+    """What it carries from step to step, for words of this shape. Raises ConfigError for a team it does not fit."""
+    follow: Callable[[Any, Words, Bool[Array, " E"]], Any] = lambda state, said, first: state
+    """(state, what was said, first) -> what it carries on."""
 
 
 Learner: TypeAlias = Any

@@ -16,7 +16,7 @@ from gacrl.errors import UserError
 from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_steps, table_of
 from gacrl.tasks.spread.environment import REPORTED_LOCAL_RATIO, Spread, SpreadState
 from gacrl.tasks.spread.settings import METRICS
-from gacrl.types import Channel, Memory, Policy, PRNGKey
+from gacrl.types import Memory, Policy, PRNGKey
 
 _FIRST_SEED = 700_000
 """MPE2's seeds of the evaluation episodes: this one and those that follow."""
@@ -33,7 +33,7 @@ def evaluate(
     env = _require_possible(env)
     worlds = [_World(env, _FIRST_SEED + episode) for episode in range(num_episodes)]
     params = env.default_params()
-    act = jax.jit(jax.vmap(lambda memory, seen, key: policy(memory, seen, key, Channel())))
+    act = jax.jit(jax.vmap(policy))
     observe = jax.jit(jax.vmap(lambda state: env.observe(state, params)))
     measures = jax.eval_shape(lambda: env.measure(env.reset(key)[0], params))
     table = table_of(list(measures), METRICS)

@@ -12,7 +12,7 @@ from gacrl.config.algorithms import LearningConfig
 from gacrl.config.checks import require
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput
-from gacrl.types import Channel, Memory, Observation, PRNGKey, Transition
+from gacrl.types import Memory, Observation, PRNGKey, Transition
 
 
 def turn_experience(env: Environment, steps: Transition, key: PRNGKey) -> Transition:
@@ -42,7 +42,6 @@ def play(
     network: AgentNetwork,
     observation: Observation,
     memory: Memory,
-    channel: Channel,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[AgentOutput, Memory]:
     """What the network puts out when nothing is drawn.
@@ -52,11 +51,11 @@ def play(
     sent grows by the number of symmetries. The message shown is the one of the world as it is.
     """
     if not symmetric or env.num_symmetries == 1:
-        return network(observation, memory, None, channel, temperature)
+        return network(observation, memory, None, temperature)
     choices = actions.choices(env)
 
     def turned(symmetry: Int[Array, ""]) -> AgentOutput:
-        output, _ = network(env.turn(observation, symmetry), (), None, channel, temperature)
+        output, _ = network(env.turn(observation, symmetry), (), None, temperature)
         return output._replace(head=output.head[:, choices.turn(jnp.arange(choices.size), symmetry)])
 
     outputs = jax.vmap(turned)(jnp.arange(env.num_symmetries))

@@ -6,6 +6,8 @@ Equation (1) is in `tasks.spread.shaping`, the encoder (2)–(3) in `networks.en
 `gacrl_paper_exploration`.
 """
 
+from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import Any, NamedTuple
 
@@ -29,11 +31,16 @@ from gacrl.config.algorithms import GacrlPaperConfig
 from gacrl.config.checks import require
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
+from gacrl.messages import interventions
+from gacrl.networks.arrives import arriving
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
-from gacrl.networks.graph import neighbour_sum, observed_adjacency
+from gacrl.networks.graph import heard_adjacency, neighbour_sum
 from gacrl.networks.layers import Linear
-from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel, transmit
-from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel
+from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+
+ROUNDS = 2
+"""Agents hear each other twice in a step: the sum of (7), and the symbols of (10)."""
 
 
 class MessageModel(eqx.Module):
@@ -52,14 +59,14 @@ class MessageModel(eqx.Module):
         self.w4 = Linear(hidden_size, vocabulary, k4)
 
     def __call__(
-        self, latent: Float[Array, "Z N"], adjacency: Bool[Array, "N N"], channel: Channel
-    ) -> Float[Array, "V N"]:
-        """Returns the logits of each agent's outgoing symbol."""
+        self, latent: Float[Array, "Z N"], adjacency: Bool[Array, "N N"], arrives: Arrives
+    ) -> tuple[Float[Array, "V N"], Float[Array, "V N"]]:
+        """Return what each agent sends along the graph, and the logits of its outgoing symbol."""
         h1 = jax.nn.relu(self.w1(latent, axis=0))  # (5)
         m = self.w2(h1, axis=0)  # (6)
-        m_sum = neighbour_sum(m, adjacency, channel)  # (7)
+        m_sum = neighbour_sum(arriving(m.T, arrives, 0, ROUNDS).T, adjacency)  # (7)
         h2 = jax.nn.relu(self.w3(jnp.concatenate([h1, m_sum]), axis=0))  # (8)
-        return self.w4(h2, axis=0)
+        return m, self.w4(h2, axis=0)
 
 
 class PolicyNetwork(eqx.Module):
@@ -137,7 +144,8 @@ class Forward(NamedTuple):
     """What one forward pass over one environment's agents computes, a column for each agent."""
 
     logits: Float[Array, "A N *b"]
-    message: Float[Array, "V N *b"]
+    messages: Float[Array, "R V N *b"]
+    """What is sent by (6), and the symbols of (9)."""
     mean: Float[Array, "Z N *b"]
     log_variance: Float[Array, "Z N *b"]
 
@@ -149,27 +157,27 @@ def forward(
     temperature: Float[Array, ""],
     noise: Noise | None,
     straight_through: bool = False,
-    channel: Channel | None = None,
-    key: PRNGKey | None = None,
-    memory: Memory = (),
-) -> tuple[Forward, Memory]:
-    """Observations to action logits, equations (2) to (11), for the N agents of one environment.
+    arrives: Arrives = Arrives(),  # noqa: B008 it is a constant
+) -> Forward:
+    """Compute action logits from observations, equations (2) to (11), for the N agents of one environment.
 
     Agents stand in columns, as the paper's W z_i + b has them; `Linear` says why that is also fast.
     Without noise: the mean latent and each agent's most likely symbol (evaluation).
     """
-    channel = Channel() if channel is None else channel
     o = features.T
     mean, log_variance = network.encoder(o, axis=0)  # (2)
     z = mean if noise is None else sample_latent(mean, log_variance, noise.latent)  # (3)
-    symbol_logits = network.message_model(z, adjacency, channel)  # (5)-(8)
+    m, symbol_logits = network.message_model(z, adjacency, arrives)  # (5)-(8)
     if noise is None:
-        message = most_likely_symbol(symbol_logits, axis=0)
+        symbol = most_likely_symbol(symbol_logits, axis=0)
     else:
-        message = gumbel_softmax(symbol_logits, noise.gumbel, temperature, straight_through, axis=0)  # (9)
-    received, memory = transmit(message, channel, key, memory)
+        symbol = gumbel_softmax(symbol_logits, noise.gumbel, temperature, straight_through, axis=0)  # (9)
+    heard = arriving(symbol.T, arrives, 1, ROUNDS).T
+    received = jnp.broadcast_to(heard[:, None, :], (heard.shape[0], *adjacency.shape))
+    if arrives.kept is not None:
+        received = received * arrives.kept[None]
     x = jnp.concatenate([o, others_side_by_side(received), z])  # (10)
-    return Forward(network.policy(x), message, mean, log_variance), memory  # (11)
+    return Forward(network.policy(x), jnp.stack([m, symbol]), mean, log_variance)  # (11)
 
 
 def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*V N"]:
@@ -205,15 +213,19 @@ class Experience(NamedTuple):
     action: Int[Array, "*b N"]
     reward: Float[Array, "*b"]
     """The team's reward as it was when earned: θ and the local ratio have moved on since."""
+    arrives: Arrives
+    """What reached the agents, where somebody intervened."""
 
 
-def no_experience(num_agents: int, observation_size: int) -> Experience:
-    """The shapes of an experience."""
+def no_experience(p: "Setup") -> Experience:
+    """Return zeros in the shapes of an experience."""
+    num_agents, message = p.env.num_agents, (ROUNDS, p.env.num_agents, p.config.vocabulary)
     return Experience(
-        features=jnp.zeros((num_agents, observation_size)),
+        features=jnp.zeros((num_agents, p.env.observation_size)),
         adjacency=jnp.zeros((num_agents, num_agents), bool),
         action=jnp.zeros(num_agents, jnp.int32),
         reward=jnp.zeros(()),
+        arrives=interventions.example(p.intervention, lambda: message),
     )
 
 
@@ -286,7 +298,9 @@ def loss(
     straight_through = config.messages == "straight_through"
     columns = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), rows)
     output = jax.vmap(
-        lambda row, noise: forward(network, row.features, row.adjacency, temperature, noise, straight_through)[0],
+        lambda row, noise: forward(
+            network, row.features, row.adjacency, temperature, noise, straight_through, row.arrives
+        ),
         in_axes=-1,
         out_axes=-1,
     )(columns, noise)
@@ -304,162 +318,189 @@ def loss(
     return total, parts
 
 
+@dataclass(frozen=True)
+class Setup:
+    """What is settled before anything is learned: constants of every function below."""
+
+    config: GacrlPaperConfig
+    env: Environment
+    adam: optax.GradientTransformation
+    followed: tuple[str, ...]
+    """Measures that (13) and (14) may follow, the first of them that the task has."""
+    intervention: str
+    """What happens to messages while training."""
+
+    @property
+    def straight_through(self) -> bool:
+        """Whether symbols are one-hot while learning."""
+        return self.config.messages == "straight_through"
+
+
 def make(
     config: GacrlPaperConfig,
     env: Environment,
-    training: TrainingConfig | None = None,
+    training: TrainingConfig = TrainingConfig(),  # noqa: B008 it is a constant
     progress: str | None = None,
 ) -> Algorithm:
-    """The paper's algorithm for this task's shapes.
+    """Make the paper's algorithm for this task's shapes; its schedules count episodes, not environment steps.
 
-    training: not looked at; the paper's schedules count episodes. progress: what (13) and (14) follow in a task that
-    has no coverage within θ. Raises ConfigError for continuous actions.
+    progress: what (13) and (14) follow in a task that has no coverage within θ. Raises ConfigError for continuous
+    actions.
     """
     require(
         not env.continuous_actions,
         f"{config.name} needs discrete actions: leave env.continuous_actions at False, or take another preset",
     )
-    num_agents, num_actions, observation_size = env.num_agents, env.num_actions, env.observation_size
-    straight_through = config.messages == "straight_through"
-    adam = optax.flatten(optax.scale_by_adam())  # one vector: a kernel for each of 28 arrays costs more
-    hyper = Hyper(
-        learning_rate=config.learning_rate,
-        learning_rate_end=config.learning_rate_end,
-        epsilon=Schedule(config.epsilon, config.epsilon_end, config.epsilon_bonus),
-        temperature=Schedule(config.temperature, config.temperature_end, config.temperature_bonus),
-        num_episodes=config.schedule_episodes,
-        radius=config.radius,
-        critic_weight=config.critic_weight,
-        kl_weight=config.kl_weight,
+    p = Setup(
+        config=config,
+        env=env,
+        adam=optax.flatten(optax.scale_by_adam()),  # one vector: a kernel for each of 28 arrays costs more
+        followed=("coverage_theta",) if progress is None else ("coverage_theta", progress),
+        intervention=training.intervention,
     )
-
-    followed = ("coverage_theta",) if progress is None else ("coverage_theta", progress)
-    packed_size, unpack = ring.packing(lambda: no_experience(num_agents, observation_size))
-
-    def init(key: PRNGKey, hyper: Hyper) -> LearnerState:
-        encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
-        policy_input = observation_size + config.vocabulary * (num_agents - 1) + config.latent_size
-        network = Network(
-            Encoder(observation_size, config.encoder_hidden, config.latent_size, encoder_key),
-            MessageModel(config.latent_size, config.message_hidden, config.vocabulary, message_key),
-            PolicyNetwork(policy_input, config.policy_hidden, num_actions, policy_key),
-            Critic(observation_size * num_agents, config.critic_hidden, critic_key),
-        )
-        return LearnerState(
-            network=network,
-            optimizer=adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
-            replay=ring.empty(jnp.zeros(packed_size), config.replay_capacity),
-            coverage=no_coverage(),
-            hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
-        )
-
-    def levels(learner: LearnerState) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """ε and τ of the moment, equations (13) to (16)."""
-        hyper, episode = learner.hyper, learner.coverage.episode
-        coverage = learner.coverage.signal(config.coverage_signal)
-        return (
-            adaptive_level(hyper.epsilon, episode, hyper.num_episodes, coverage),
-            adaptive_level(hyper.temperature, episode, hyper.num_episodes, coverage),
-        )
-
-    def policy(learner: LearnerState, explore: bool) -> Policy:
-        epsilon, temperature = levels(learner)
-
-        def act(
-            memory: Memory, observation: Observation, key: PRNGKey, channel: Channel
-        ) -> tuple[Decision, Memory]:
-            noise, choice = draw_noise(key, num_agents, num_actions, config) if explore else (None, None)
-            adjacency = observed_adjacency(observation, learner.hyper.radius)
-            output, memory = forward(
-                learner.network,
-                observation.features,
-                adjacency,
-                temperature,
-                noise,
-                straight_through,
-                channel,
-                jax.random.fold_in(key, 1),
-                memory,
-            )
-            logits = jnp.where(observation.action_mask, output.logits.T, -jnp.inf)
-            if choice is None:
-                action = logits.argmax(-1)
-            else:  # the largest of log p + Gumbel noise is a sample of p
-                action = (jnp.log(behaviour_probabilities(logits, epsilon)) + choice).argmax(-1)
-            extras: dict[str, Any] = {"value": learner.network.critic(observation.features)}
-            if noise is not None:
-                extras["noise"] = noise
-            return Decision(action, output.message.T, adjacency, extras), memory
-
-        return act
-
-    def learn_from_step(learner: LearnerState, step: Transition, key: PRNGKey) -> tuple[LearnerState, Metrics]:
-        """Remember one step of one environment, then take one gradient step of Adam."""
-        sample_key, noise_key = jax.random.split(key)
-        epsilon, temperature = levels(learner)
-        current = Experience(
-            step.observation.features,
-            step.decision.adjacency,  # pyright: ignore[reportArgumentType] this policy always sets it
-            step.decision.action,
-            step.reward.mean(),
-        )
-        replay = ring.add(learner.replay, ring.pack(current))
-        sampled = ring.sample_rows(replay, sample_key, config.batch_size)
-        rows = jax.vmap(unpack)(ring.take(replay, jnp.append(sampled, ring.newest(replay))))
-        fresh, _ = draw_noise(noise_key, num_agents, 0, config, config.batch_size)
-        noise = jax.tree.map(
-            lambda fresh, acted: jnp.concatenate([fresh, acted[..., None]], axis=-1),
-            fresh,
-            step.decision.extras["noise"],
-        )
-        gradients, losses = jax.grad(loss, has_aux=True)(
-            learner.network, learner.hyper, rows, temperature, noise, config
-        )
-        directions, optimizer = adam.update(gradients, learner.optimizer)
-        hyper = learner.hyper
-        learning_rate = linear_decay(
-            hyper.learning_rate, hyper.learning_rate_end, learner.coverage.episode, hyper.num_episodes
-        )
-        network = jax.tree.map(lambda w, d: w - learning_rate * d, learner.network, directions)
-        learner = learner._replace(network=network, optimizer=optimizer, replay=replay)
-        return learner, {**losses, "epsilon": epsilon, "temperature": temperature}
-
-    def update(learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
-        """One gradient step per environment step, in the order in which they were taken."""
-        time, environments = rollout.transitions.reward.shape[:2]
-
-        def learn_from_steps(
-            learner: LearnerState, inputs: tuple[Transition, Key[Array, " E"]]
-        ) -> tuple[LearnerState, Metrics]:
-            """What E environments did at one time; coverage moves on when all of it is learned from."""
-            steps = inputs[0]
-            if environments == 1:
-                learner, metrics = learn_from_step(learner, *jax.tree.map(lambda leaf: leaf[0], inputs))
-            else:
-                learner, metrics = jax.lax.scan(
-                    lambda learner, inputs: learn_from_step(learner, *inputs), learner, inputs
-                )
-                metrics = jax.tree.map(lambda values: values.mean(0), metrics)
-            done = steps.terminated | steps.truncated
-            coverage = next((steps.info[name] for name in followed if name in steps.info), jnp.zeros(done.shape))
-            return learner._replace(coverage=follow_coverage(learner.coverage, coverage, done)), metrics
-
-        single = time * environments == 1
-        keys = key[None, None] if single else jax.random.split(key, (time, environments))
-        if time == 1:
-            return learn_from_steps(learner, jax.tree.map(lambda leaf: leaf[0], (rollout.transitions, keys)))
-        learner, metrics = jax.lax.scan(learn_from_steps, learner, (rollout.transitions, keys))
-        return learner, jax.tree.map(lambda values: values.mean(0), metrics)
-
     return Algorithm(
-        init=init,
+        init=partial(init, p),
         initial_memory=lambda num_agents: (),
-        policy=policy,
-        update=update,
-        hyper=hyper,
+        policy=partial(policy, p),
+        update=partial(update, p),
+        hyper=Hyper(
+            learning_rate=config.learning_rate,
+            learning_rate_end=config.learning_rate_end,
+            epsilon=Schedule(config.epsilon, config.epsilon_end, config.epsilon_bonus),
+            temperature=Schedule(config.temperature, config.temperature_end, config.temperature_bonus),
+            num_episodes=config.schedule_episodes,
+            radius=config.radius,
+            critic_weight=config.critic_weight,
+            kl_weight=config.kl_weight,
+        ),
         acting=lambda learner: learner._replace(optimizer=(), replay=()),
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[1:], ())),
         replay=lambda learner: learner.replay,
         batch_steps=config.batch_size,
     )
+
+
+def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
+    """Make a learner that has learned nothing."""
+    config, num_agents, observation_size = p.config, p.env.num_agents, p.env.observation_size
+    encoder_key, message_key, policy_key, critic_key = jax.random.split(key, 4)
+    policy_input = observation_size + config.vocabulary * (num_agents - 1) + config.latent_size
+    network = Network(
+        Encoder(observation_size, config.encoder_hidden, config.latent_size, encoder_key),
+        MessageModel(config.latent_size, config.message_hidden, config.vocabulary, message_key),
+        PolicyNetwork(policy_input, config.policy_hidden, p.env.num_actions, policy_key),
+        Critic(observation_size * num_agents, config.critic_hidden, critic_key),
+    )
+    packed_size, _ = ring.packing(partial(no_experience, p))
+    return LearnerState(
+        network=network,
+        optimizer=p.adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
+        replay=ring.empty(jnp.zeros(packed_size), config.replay_capacity),
+        coverage=no_coverage(),
+        hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
+    )
+
+
+def levels(p: Setup, learner: LearnerState) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return ε and τ of the moment, equations (13) to (16)."""
+    hyper, episode = learner.hyper, learner.coverage.episode
+    coverage = learner.coverage.signal(p.config.coverage_signal)
+    return (
+        adaptive_level(hyper.epsilon, episode, hyper.num_episodes, coverage),
+        adaptive_level(hyper.temperature, episode, hyper.num_episodes, coverage),
+    )
+
+
+def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
+    """Act by (11), mixed with random actions while exploring; greedily, with the most likely symbols, if not."""
+    epsilon, temperature = levels(p, learner)
+
+    def act(memory: Memory, observation: Observation, key: PRNGKey) -> tuple[Decision, Memory]:
+        num_agents, num_actions = p.env.num_agents, p.env.num_actions
+        noise, choice = draw_noise(key, num_agents, num_actions, p.config) if explore else (None, None)
+        adjacency = heard_adjacency(observation, learner.hyper.radius)
+        output = forward(
+            learner.network,
+            observation.features,
+            adjacency,
+            temperature,
+            noise,
+            p.straight_through,
+            observation.arrives,
+        )
+        logits = jnp.where(observation.action_mask, output.logits.T, -jnp.inf)
+        if choice is None:
+            action = logits.argmax(-1)
+        else:  # the largest of log p + Gumbel noise is a sample of p
+            action = (jnp.log(behaviour_probabilities(logits, epsilon)) + choice).argmax(-1)
+        extras: dict[str, Any] = {"value": learner.network.critic(observation.features)}
+        if noise is not None:
+            extras["noise"] = noise
+        return Decision(action, jnp.moveaxis(output.messages, 1, 2), adjacency, extras), memory
+
+    return act
+
+
+def learn_from_step(
+    p: Setup, learner: LearnerState, step: Transition, key: PRNGKey
+) -> tuple[LearnerState, Metrics]:
+    """Remember one step of one environment, then take one gradient step of Adam."""
+    sample_key, noise_key = jax.random.split(key)
+    epsilon, temperature = levels(p, learner)
+    current = Experience(
+        step.observation.features,
+        step.decision.adjacency,  # pyright: ignore[reportArgumentType] this policy always sets it
+        step.decision.action,
+        step.reward.mean(),
+        step.observation.arrives,
+    )
+    replay = ring.add(learner.replay, ring.pack(current))
+    sampled = ring.sample_rows(replay, sample_key, p.config.batch_size)
+    _, unpack = ring.packing(partial(no_experience, p))
+    rows = jax.vmap(unpack)(ring.take(replay, jnp.append(sampled, ring.newest(replay))))
+    fresh, _ = draw_noise(noise_key, p.env.num_agents, 0, p.config, p.config.batch_size)
+    noise = jax.tree.map(
+        lambda fresh, acted: jnp.concatenate([fresh, acted[..., None]], axis=-1),
+        fresh,
+        step.decision.extras["noise"],
+    )
+    gradient = jax.grad(loss, has_aux=True)
+    gradients, losses = gradient(learner.network, learner.hyper, rows, temperature, noise, p.config)
+    directions, optimizer = p.adam.update(gradients, learner.optimizer)
+    hyper = learner.hyper
+    learning_rate = linear_decay(
+        hyper.learning_rate, hyper.learning_rate_end, learner.coverage.episode, hyper.num_episodes
+    )
+    network = jax.tree.map(lambda w, d: w - learning_rate * d, learner.network, directions)
+    learner = learner._replace(network=network, optimizer=optimizer, replay=replay)
+    return learner, {**losses, "epsilon": epsilon, "temperature": temperature}
+
+
+def learn_from_steps(
+    p: Setup, learner: LearnerState, inputs: tuple[Transition, Key[Array, " E"]]
+) -> tuple[LearnerState, Metrics]:
+    """Learn from what E environments did at one time; coverage moves on when all of it is learned from."""
+    steps = inputs[0]
+    if steps.reward.shape[0] == 1:
+        learner, metrics = learn_from_step(p, learner, *jax.tree.map(lambda leaf: leaf[0], inputs))
+    else:
+        learner, metrics = jax.lax.scan(
+            lambda learner, inputs: learn_from_step(p, learner, *inputs), learner, inputs
+        )
+        metrics = jax.tree.map(lambda values: values.mean(0), metrics)
+    done = steps.terminated | steps.truncated
+    coverage = next((steps.info[name] for name in p.followed if name in steps.info), jnp.zeros(done.shape))
+    return learner._replace(coverage=follow_coverage(learner.coverage, coverage, done)), metrics
+
+
+def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
+    """Take one gradient step per environment step, in the order in which they were taken."""
+    time, environments = rollout.transitions.reward.shape[:2]
+    single = time * environments == 1
+    keys = key[None, None] if single else jax.random.split(key, (time, environments))
+    learn = partial(learn_from_steps, p)
+    if time == 1:
+        return learn(learner, jax.tree.map(lambda leaf: leaf[0], (rollout.transitions, keys)))
+    learner, metrics = jax.lax.scan(learn, learner, (rollout.transitions, keys))
+    return learner, jax.tree.map(lambda values: values.mean(0), metrics)

@@ -34,7 +34,7 @@ from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
 from gacrl.networks.critic import Critic, View
 from gacrl.networks.memory import beginnings, restarted
-from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
 
 class Network(eqx.Module):
@@ -220,15 +220,15 @@ def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
     """Sampled from π, among random actions where the rule of exploration has some; or greedy."""
     level = level_of(p, learner)
 
-    def act(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel) -> tuple[Decision, Memory]:
+    def act(memory: Memory, observation: Observation, key: PRNGKey) -> tuple[Decision, Memory]:
         actor_memory, critic_memory, mode = split_memory(memory)
         talk_key, choice_key = jax.random.split(key)
         actor, temperature, extras = learner.network.actor, level.temperature, {}
         if explore:
-            output, actor_memory = actor(observation, actor_memory, talk_key, channel, temperature)
+            output, actor_memory = actor(observation, actor_memory, talk_key, temperature)
         else:
             symmetric = p.config.symmetric_play
-            output, actor_memory = play(p.env, symmetric, actor, observation, actor_memory, channel, temperature)
+            output, actor_memory = play(p.env, symmetric, actor, observation, actor_memory, temperature)
         log_probs = log_policy(output.head, p.actions.mask(observation.action_mask))
         if explore:
             settles = jax.tree.leaves(mode)  # where nothing does, nothing is drawn for it
@@ -245,7 +245,7 @@ def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
             "key": talk_key,
             "mode": mode,
         }
-        decision = Decision(p.actions.act(choice), output.message, output.adjacency, extras)
+        decision = Decision(p.actions.act(choice), output.messages, output.adjacency, extras)
         return decision, PpoMemory(actor_memory, critic_memory, mode) if memory else ()
 
     return act

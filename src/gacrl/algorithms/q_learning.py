@@ -28,9 +28,10 @@ from gacrl.config.algorithms import QLearningConfig
 from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.agent import AgentNetwork, AgentOutput, matched, unroll
+from gacrl.messages import interventions
+from gacrl.networks.agent import AgentNetwork, AgentOutput, matched, unroll, words_said
 from gacrl.networks.memory import beginnings, restarted
-from gacrl.types import Channel, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
+from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
 HUBER_DELTA = 10.0
 """Errors beyond this count linearly."""
@@ -81,6 +82,8 @@ class Setup:
     """Its shapes."""
     fresh: Memory
     """The network's memory at an episode's start."""
+    arrives: Arrives
+    """The shapes of what arrives in a step, where somebody intervenes while training."""
 
     @property
     def window(self) -> int:
@@ -155,6 +158,7 @@ def make(
         num_steps=training.num_steps,
         network=network,
         fresh=network.agent.initial_memory(env.num_agents),
+        arrives=interventions.example(training.intervention, partial(words_said, network.agent, env)),
     )
     require_no_memory_in_symmetric_play(config, env, q.fresh)
     return Algorithm(
@@ -217,6 +221,7 @@ def example(q: Setup) -> Experience:
     choice = jnp.zeros(q.env.num_agents, jnp.int32)
     after, false = q.env.step(state, q.actions.act(choice), key, params)[1], jnp.zeros((), bool)
     seen, left = after.observation, after.left
+    observation, seen = (it._replace(arrives=q.arrives) for it in (observation, seen))
     step = Transition(observation, Decision(choice), after.reward, false, false, false, seen, {}, left)
     return Experience(step, q.fresh)
 
@@ -241,18 +246,18 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
     network = learner.target if q.config.averaged and not explore else learner.network
     level = q.explorer.level(learner.exploration, learner.env_steps)
 
-    def act(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel) -> tuple[Decision, Memory]:
+    def act(memory: Memory, observation: Observation, key: PRNGKey) -> tuple[Decision, Memory]:
         remembered = memory if isinstance(memory, ActMemory) else ActMemory((), ())
         mode_key, talk_key, action_key = jax.random.split(key, 3)
         before, mode = remembered.network, remembered.exploration
         if explore:
-            output, after = network.agent(observation, before, talk_key, channel, level.temperature)
+            output, after = network.agent(observation, before, talk_key, level.temperature)
             mode, epsilon = q.explorer.begin(mode, mode_key, level.epsilon)
             available = q.actions.mask(observation.action_mask)
             choice = epsilon_greedy(action_key, output.head, available, epsilon)
         else:
             symmetric = q.config.symmetric_play
-            output, after = play(q.env, symmetric, network.agent, observation, before, channel, level.temperature)
+            output, after = play(q.env, symmetric, network.agent, observation, before, level.temperature)
             choice = greedy(output.head, q.actions.mask(observation.action_mask))
         best = greedy(output.head, q.actions.mask(observation.action_mask))
         value = q.parts.team_value(network, output, best, observation).mean()
@@ -262,7 +267,7 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
             "memory": before,
             "mode": mode,
         }
-        decision = Decision(q.actions.act(choice), output.message, output.adjacency, extras)
+        decision = Decision(q.actions.act(choice), output.messages, output.adjacency, extras)
         return decision, ActMemory(after, mode) if isinstance(memory, ActMemory) else ()
 
     return act

@@ -36,6 +36,9 @@ class TrainingConfig:
     """Environments side by side."""
     num_steps: int = 1
     """Steps of each environment between two updates."""
+    intervention: str = ""
+    """What happens to messages on their way, in training and in its evaluations: silence [AGENT …], swap AGENT AGENT,
+    scramble, drop PROBABILITY, delay STEPS or noise PROBABILITY; nothing by default."""
 
     def __post_init__(self) -> None:
         between("training", self, 1, 1e12, "env_steps")

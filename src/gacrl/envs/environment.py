@@ -77,6 +77,19 @@ class Environment(ABC):
         nothing, nobody = jnp.zeros((num_agents, 0, 2)), jnp.zeros((num_agents, 0), bool)
         return Entities(observation.features, nothing, nothing, nobody, nobody)
 
+    def sight(self, observation: Observation) -> Float[Array, "N N S"]:
+        """Return what each agent itself sees of each other one: entry [i, j] is the offset from i to j, then features.
+
+        Messages arrive with it. By default it is what `entities` says of the other agents, where those are all others
+        in order, and 0 of those out of sight. Otherwise S = 0: voices cannot be told apart by where they come from.
+        """
+        seen = self.entities(observation)
+        num_agents, others = seen.agents.shape[:2]
+        if others == 0 or others != num_agents - 1:
+            return jnp.zeros((num_agents, num_agents, 0))
+        known = [seen.agents] if seen.agent_features is None else [seen.agents, seen.agent_features]
+        return with_self(jnp.where(seen.agent_mask[..., None], jnp.concatenate(known, axis=-1), 0.0))
+
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
         """The observation of the turned world."""
         return observation
@@ -126,6 +139,14 @@ def observe(
         adjacency=adjacency,
         state=state,
     )
+
+
+def with_self(pairs: Float[Array, "N M F"]) -> Float[Array, "N N F"]:
+    """Insert an entry i of zeros into row i of what N agents have for each of M = N - 1 others in order."""
+    size, rest = pairs.shape[0], pairs.shape[2:]
+    rows = pairs.reshape(size - 1, size, *rest)  # in one long row, entry i of row i is every (N + 1)st
+    rows = jnp.pad(rows, ((0, 0), (0, 1), *[(0, 0)] * len(rest))).reshape(size * size - 1, *rest)
+    return jnp.pad(rows, ((1, 0), *[(0, 0)] * len(rest))).reshape(size, size, *rest)
 
 
 def side_by_side(seen: Sequence[Float[Array, " _"]], roles: Sequence[int] | None = None) -> Float[Array, "N O"]:

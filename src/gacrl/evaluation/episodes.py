@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams, EnvState
 from gacrl.scene import Discs, Scene, compose, discs
-from gacrl.types import Channel, Memory, Observation, Policy, PRNGKey, Transition
+from gacrl.types import Intervention, Memory, Observation, Policy, PRNGKey, Transition
 
 Look: TypeAlias = Callable[[EnvState, EnvParams], Scene]
 """What there is to see of a state: a task's scene, its settings given."""
@@ -39,8 +39,8 @@ class Episode:
     """False for agents that are not there."""
     scene: Scene | None = None
     """Of NumPy arrays, T + 1 rows in each; None where there is nothing to see."""
-    messages: Float[np.ndarray, "T N V"] | None = None
-    """What each agent sent; None where the policy says nothing."""
+    messages: Float[np.ndarray, "T R N V"] | None = None
+    """What each agent sent in each round; None where the policy says nothing."""
     adjacency: Bool[np.ndarray, "T N N"] | None = None
     """Entry [t, i, j]: j's message reaches i. None where the policy uses no graph."""
 
@@ -58,11 +58,12 @@ class Episode:
         return np.concatenate([[0.0], np.cumsum(self.reward_raw, dtype=float)])
 
     @property
-    def symbols(self) -> Int[np.ndarray, "T N"] | None:
-        """The most likely symbol of each message; −1 for a message of zeros, which says nothing."""
+    def symbols(self) -> Int[np.ndarray, "T R N"] | None:
+        """Return the most likely symbol of each message; −1 for one that says nothing or is not made of symbols."""
         if self.messages is None:
             return None
-        return np.where(self.messages.any(-1), self.messages.argmax(-1), -1)
+        distribution = (self.messages >= 0).all(-1) & (np.abs(self.messages.sum(-1) - 1) < 1e-3)
+        return np.where(distribution, self.messages.argmax(-1), -1)
 
     def save(self, path: Path) -> None:
         """Write the episode as an .npz of plain arrays. Raises OSError where the file cannot be written."""
@@ -137,7 +138,7 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         "reward": (steps, agents),
         "reward_raw": (steps,),
         "agent_mask": (steps, agents),
-        "messages": (steps, agents, None),
+        "messages": (steps, None, agents, None),
         "adjacency": (steps, agents, agents),
         **{f"scene.{g}.{part}": (steps + 1, n, *rest) for g, n in counts.items() for part, rest in disc.items()},
         "scene.lines": (steps + 1, None, 2, 2),
@@ -177,7 +178,7 @@ def record_many(
     params: EnvParams,
     key: PRNGKey,
     num_episodes: int,
-    channel: Channel | None = None,
+    intervention: Intervention | None = None,
     look: Look | None = None,
 ) -> list[Episode]:
     """K episodes, each up to its end: the very episodes that `evaluate` measures with the same arguments.
@@ -196,25 +197,24 @@ def record_many(
         )
 
     @jax.jit
-    def play(memory: Memory, params: EnvParams, key: PRNGKey, channel: Channel | None) -> _Played:
+    def play(memory: Memory, params: EnvParams, key: PRNGKey) -> _Played:
         def one_step(
             carry: rollout.Carry, key: PRNGKey
         ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
             keys = jax.random.split(key, (num_episodes, 3))
-            state, remembered, step = rollout.act(env, policy, params, carry, keys, channel)
-            seen = view(state, step.next_observation, params)
-            carry = rollout.renew(env, memory, params, state, remembered, step, keys)
-            return carry, (step, carry.first, seen)
+            after, step = rollout.act(env, policy, params, carry, keys, intervention)
+            seen = view(after.env_state, step.next_observation, params)
+            return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
 
         start_key, act_key = jax.random.split(key)
-        carry = rollout.start(env, params, memory, start_key, num_episodes)
+        carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
         opening = view(carry.env_state, carry.observation, params)
         _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
         scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
         return _Played(
             scene=scene,
             actions=steps.decision.action,
-            messages=steps.decision.message,
+            messages=steps.decision.messages,
             adjacency=steps.decision.adjacency,
             reward=steps.reward,
             reward_raw=steps.info["reward_raw"],
@@ -222,7 +222,7 @@ def record_many(
             agent_mask=steps.observation.agent_mask,
         )
 
-    played = jax.device_get(play(initial_memory, params, key, channel))
+    played = jax.device_get(play(initial_memory, params, key))
 
     def one(k: int) -> Episode:
         steps = int(played.done[:, k].argmax()) + 1  # the time limit ends what nothing else has ended
@@ -257,7 +257,7 @@ class _Played(NamedTuple):
 
     scene: Scene | None
     actions: Int[Array, "T E N"] | Float[Array, "T E N A"]
-    messages: Float[Array, "T E N V"] | None
+    messages: Float[Array, "T E R N V"] | None
     adjacency: Bool[Array, "T E N N"] | None
     reward: Float[Array, "T E N"]
     reward_raw: Float[Array, "T E"]

@@ -12,7 +12,7 @@ from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_steps, table_of
 from gacrl.tasks.task import RETURN, Metric
-from gacrl.types import Channel, Memory, Policy, PRNGKey
+from gacrl.types import Intervention, Memory, Policy, PRNGKey
 
 Stream = Literal["training", "monitor", "gate", "report"]
 """Random streams that never meet: training, the evaluations along the way, success gates, and the report."""
@@ -33,23 +33,26 @@ def evaluate(
     params: EnvParams,
     key: PRNGKey,
     num_episodes: int,
-    channel: Channel | None = None,
+    intervention: Intervention | None = None,
     metrics: Mapping[str, Metric] = RETURN,
 ) -> dict[str, Float[Array, " K"]]:
     """The metrics of K episodes, each up to its end or the environment's time limit.
 
-    metrics: those of the task; a measure without one gets its mean. The key fixes the starts and the policy's draws:
+    intervention: what happens to the agents' messages. metrics: those of the task; a measure without one gets its
+    mean. The key fixes the starts and the policy's draws:
     the same key gives every policy the same starts.
     """
     start_key, act_key = jax.random.split(key)
-    carry = rollout.start(env, params, initial_memory, start_key, num_episodes)
-    first_step = jax.eval_shape(lambda: rollout.step(env, policy, initial_memory, params, carry, act_key)[1])
+    carry = rollout.start(env, params, initial_memory, start_key, num_episodes, intervention, policy)
+    first_step = jax.eval_shape(
+        lambda: rollout.step(env, policy, initial_memory, params, carry, act_key, intervention)[1]
+    )
     table = table_of(list(first_step.info), metrics)
     tally = jax.vmap(lambda _: no_steps(table))(jnp.arange(num_episodes))
 
     def one_step(loop: tuple[rollout.Carry, Array, Tally], key: PRNGKey):
         carry, going, tally = loop
-        carry, transition = rollout.step(env, policy, initial_memory, params, carry, key, channel)
+        carry, transition = rollout.step(env, policy, initial_memory, params, carry, key, intervention)
         tally = jax.vmap(count_step_if)(going, tally, transition.info)
         return (carry, going & ~carry.first, tally), None
 

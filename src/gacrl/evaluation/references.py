@@ -15,7 +15,7 @@ from gacrl.errors import ConfigError
 from gacrl.evaluation.episodes import Look
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.tasks.task import Task
-from gacrl.types import Actor, Channel, Decision, Memory, Observation, PRNGKey
+from gacrl.types import Actor, Decision, Memory, Observation, PRNGKey
 
 FLOORS = ("random", "noop")
 """Every task has them."""
@@ -24,7 +24,7 @@ FLOORS = ("random", "noop")
 def random(env: Environment) -> Actor:
     """Every available action is equally likely."""
 
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
             return Decision(jax.random.uniform(key, (env.num_agents, env.num_actions))), memory
         available = observation.action_mask
@@ -37,7 +37,7 @@ def random(env: Environment) -> Actor:
 def noop(env: Environment) -> Actor:
     """Every agent takes its first available action, or pushes nowhere."""
 
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
             return Decision(jnp.zeros((env.num_agents, env.num_actions))), memory
         return Decision(observation.action_mask.argmax(-1)), memory

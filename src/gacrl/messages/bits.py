@@ -17,7 +17,7 @@ def bits_used(episodes: Sequence[Episode]) -> float | None:
     for episode in episodes:
         if episode.messages is None or not _symbols(episode.messages):
             return None
-        spoken = episode.messages[episode.agent_mask].sum(0)
+        spoken = episode.messages[:, -1][episode.agent_mask].sum(0)
         counts = spoken if counts is None else counts + spoken
     if counts is None or counts.sum() == 0:
         return None

@@ -3,6 +3,7 @@
 Q-learning takes the head for the values of the actions, PPO for logits, and critics have a head of one.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,11 +19,11 @@ from gacrl.networks import communication
 from gacrl.networks import torso as torsos
 from gacrl.networks.communication.base import Communication, Neighbourhood
 from gacrl.networks.encoder import Code
-from gacrl.networks.graph import audible, observed_adjacency
+from gacrl.networks.graph import heard_adjacency, nearest_speakers
 from gacrl.networks.gru import Gru
 from gacrl.networks.layers import Linear, num_parameters
 from gacrl.networks.memory import restarted
-from gacrl.types import Channel, Memory, Observation, PRNGKey
+from gacrl.types import Memory, Observation, PRNGKey
 
 
 class AgentMemory(NamedTuple):
@@ -35,7 +36,7 @@ class AgentMemory(NamedTuple):
 class AgentOutput(NamedTuple):
     head: Float[Array, "N A"]
     hidden: Float[Array, "N H"]
-    message: Float[Array, "N V"] | None
+    messages: Float[Array, "R N V"] | None
     adjacency: Bool[Array, "N N"]
     entropy: Float[Array, " N"] | float
     """Of the symbols sent, nats; 0 without symbols."""
@@ -62,6 +63,8 @@ class AgentNetwork(eqx.Module):
     communication: Communication
     head: Linear
     radius: float = eqx.field(static=True)
+    nearest: int | None = eqx.field(static=True)
+    sight: Callable[[Observation], Float[Array, "N N S"]] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,9 +80,9 @@ class AgentNetwork(eqx.Module):
         self.torso = torsos.make(env, config, torso_key, gain)
         self.code = None if config.latent == "none" else Code(config, code_key)
         self.memory = Gru(config.width, memory_key) if config.recurrent else None
-        self.communication = communication.make(config, communication_key, gain)
+        self.communication = communication.make(env, config, communication_key, gain)
         self.head = Linear(config.width, num_outputs, head_key, head_gain)
-        self.radius = config.radius
+        self.radius, self.nearest, self.sight = config.radius, config.nearest_agents, env.sight
 
     def initial_memory(self, num_agents: int) -> Memory:
         """() for a network that remembers nothing."""
@@ -94,53 +97,52 @@ class AgentNetwork(eqx.Module):
         observation: Observation,
         memory: Memory = (),
         key: PRNGKey | None = None,
-        channel: Channel | None = None,
         temperature: Float[Array, ""] | float = 1.0,
     ) -> tuple[AgentOutput, Memory]:
         """Without a key nothing is drawn: the most likely symbols, DIAL's bits."""
         remembered = memory if isinstance(memory, AgentMemory) else AgentMemory((), ())
-        seen = self.see(observation, remembered.inbox, key, channel)
+        seen = self.see(observation, remembered.inbox, key)
         carry = remembered.carry
         if self.memory is not None:
             carry = self.memory(seen.hidden, carry)
             seen = seen._replace(hidden=carry)
-        output, inbox = self.say(observation, seen, key, channel, temperature)
+        output, inbox = self.say(observation, seen, key, temperature)
         return output, AgentMemory(carry, inbox) if isinstance(memory, AgentMemory) else ()
 
-    def see(
-        self, observation: Observation, inbox: Any, key: PRNGKey | None, channel: Channel | None = None
-    ) -> Seen:
+    def see(self, observation: Observation, inbox: Any, key: PRNGKey | None) -> Seen:
         """What comes before the memory: what is seen, its code, and what was heard of the step before."""
         hidden, code, code_loss = self.torso(observation), None, 0.0
         if self.code is not None:
             code, hidden, code_loss = self.code(hidden, None if key is None else jax.random.fold_in(key, 2_000))
-        _, near, channel = self._around(observation, channel)
-        return Seen(self.communication.hear(hidden, inbox, near, channel, key), code, code_loss)
+        _, near = self._around(observation)
+        return Seen(self.communication.hear(hidden, inbox, near, key), code, code_loss)
 
     def say(
         self,
         observation: Observation,
         seen: Seen,
         key: PRNGKey | None,
-        channel: Channel | None,
         temperature: Float[Array, ""] | float,
     ) -> tuple[AgentOutput, Any]:
         """What comes after the memory: communication and head; and the inbox for the next step."""
-        adjacency, near, channel = self._around(observation, channel)
-        spoken = self.communication.speak(seen.hidden, near, channel, key, temperature, seen.code)
-        message = spoken.message
-        if message is not None:
-            message = jnp.where(observation.agent_mask[:, None], message, 0.0)
+        adjacency, near = self._around(observation)
+        spoken = self.communication.speak(seen.hidden, near, key, temperature, seen.code)
+        messages = spoken.messages
+        if messages is not None:
+            messages = jnp.where(observation.agent_mask[:, None], messages, 0.0)
         head = self.head(spoken.hidden)
-        output = AgentOutput(head, spoken.hidden, message, adjacency, spoken.entropy, seen.code_loss, spoken.loss)
+        output = AgentOutput(head, spoken.hidden, messages, adjacency, spoken.entropy, seen.code_loss, spoken.loss)
         return output, spoken.inbox
 
-    def _around(
-        self, observation: Observation, channel: Channel | None
-    ) -> tuple[Bool[Array, "N N"], Neighbourhood, Channel]:
-        channel = Channel() if channel is None else channel
-        adjacency = observed_adjacency(observation, self.radius)
-        return adjacency, Neighbourhood(audible(adjacency, channel), _offsets(observation)), channel
+    def _around(self, observation: Observation) -> tuple[Bool[Array, "N N"], Neighbourhood]:
+        """Return the edges along which something arrives, and what each agent's network is given of them."""
+        adjacency, sight = heard_adjacency(observation, self.radius), self.sight(observation)
+        if self.nearest is None or self.nearest >= adjacency.shape[0]:
+            return adjacency, Neighbourhood(adjacency, sight, arrives=observation.arrives)
+        speakers = nearest_speakers(observation.positions, adjacency, self.nearest)
+        near = jnp.take_along_axis(adjacency, speakers, axis=1)
+        seen = jnp.take_along_axis(sight, speakers[..., None], axis=1)
+        return adjacency, Neighbourhood(near, seen, speakers, observation.arrives)
 
 
 def unroll(
@@ -157,11 +159,11 @@ def unroll(
     computed for all steps at once.
     """
     if not isinstance(memory, AgentMemory):
-        return jax.vmap(lambda seen, key: network(seen, (), key, None, temperature))(observations, keys)
+        return jax.vmap(lambda seen, key: network(seen, (), key, temperature))(observations, keys)
     if network.memory is not None and not jax.tree.leaves(memory.inbox):
         seen = jax.vmap(lambda observation, key: network.see(observation, (), key))(observations, keys)
         carries = network.memory.unroll(seen.hidden, first, memory.carry)
-        say = partial(network.say, channel=None, temperature=temperature)
+        say = partial(network.say, temperature=temperature)
         output, _ = jax.vmap(say)(observations, seen._replace(hidden=carries), keys)
         return output, AgentMemory(carries, memory.inbox)
     fresh = network.initial_memory(observations.features.shape[-2])
@@ -169,10 +171,21 @@ def unroll(
     def step(memory: Memory, inputs: tuple[Observation, Bool[Array, "..."], Any]):
         seen, first, key = inputs
         memory = restarted(fresh, memory, first)
-        output, memory = network(seen, memory, key, None, temperature)
+        output, memory = network(seen, memory, key, temperature)
         return memory, (output, memory)
 
     return jax.lax.scan(step, memory, (observations, first, keys))[1]
+
+
+def words_said(network: AgentNetwork, env: Environment) -> tuple[int, ...] | None:
+    """Return the shape [R, N, V] of what the agents say in a step; None where they say nothing."""
+
+    def messages() -> Array | None:
+        seen = env.reset(jax.random.key(0), env.default_params())[1]
+        return network(seen, network.initial_memory(env.num_agents))[0].messages
+
+    said = jax.eval_shape(messages)
+    return None if said is None else said.shape
 
 
 def acting_parameters(env: Environment, config: NetworkConfig, num_outputs: int) -> int:
@@ -197,10 +210,3 @@ def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> Networ
         low, high = (middle, high) if size(middle) < wanted else (low, middle)
     width = min((low, high), key=lambda width: abs(size(width) - wanted))
     return replace(config, width=width, parameters=None)
-
-
-def _offsets(observation: Observation) -> Float[Array, "N N 2"]:
-    num_agents = observation.features.shape[0]
-    if observation.positions is None:
-        return jnp.zeros((num_agents, num_agents, 2))
-    return observation.positions[None, :, :] - observation.positions[:, None, :]

@@ -2,9 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.types import Channel, Observation
+from gacrl.envs.environment import Environment
+from gacrl.types import Observation
 
 
 def proximity_adjacency(
@@ -26,25 +27,45 @@ def observed_adjacency(observation: Observation, radius: Float[Array, ""] | floa
     return mask[:, None] & mask[None, :] & ~jnp.eye(mask.shape[0], dtype=bool)
 
 
-def audible(adjacency: Bool[Array, "N N"], channel: Channel) -> Bool[Array, "N N"]:
-    """The edges that the channel does not cut: to be silenced is not to be heard, also by attention and in means."""
-    return adjacency if channel.edge_keep is None else adjacency & (channel.edge_keep > 0)
+def heard_adjacency(observation: Observation, radius: Float[Array, ""] | float) -> Bool[Array, "N N"]:
+    """Return the edges along which something arrives: those of the graph that nobody has cut."""
+    adjacency, kept = observed_adjacency(observation, radius), observation.arrives.kept
+    return adjacency if kept is None else adjacency & kept
 
 
-def neighbour_sum(
-    messages: Float[Array, "V N"], adjacency: Bool[Array, "N N"], channel: Channel
-) -> Float[Array, "V N"]:
+def nearest_speakers(
+    positions: Float[Array, "N 2"] | None, adjacency: Bool[Array, "N N"], count: int
+) -> Int[Array, "N K"]:
+    """Return each agent's `count` nearest neighbours, nearest first; without positions its first ones."""
+    if positions is None:
+        squared = jnp.zeros(adjacency.shape)
+    else:
+        squared = jnp.square(positions[None, :, :] - positions[:, None, :]).sum(-1)
+    return jax.lax.top_k(-jnp.where(adjacency, squared, jnp.inf), count)[1]
+
+
+def neighbour_sum(messages: Float[Array, "V N"], adjacency: Bool[Array, "N N"]) -> Float[Array, "V N"]:
     """Equation (7): column i is the sum of the columns of i's neighbours; no normalisation, no self edge."""
-    weights = adjacency.astype(messages.dtype)
-    if channel.edge_keep is not None:
-        weights *= channel.edge_keep
-    return messages @ weights.T
+    return messages @ adjacency.astype(messages.dtype).T
 
 
 def with_length(offsets: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     """The offset and its length; finite gradients at 0."""
     length = jnp.sqrt(jnp.square(offsets).sum(-1, keepdims=True) + 1e-8)
     return jnp.concatenate([offsets, length], axis=-1)
+
+
+def sighted(sight: Float[Array, "N K S"]) -> Float[Array, "N K F"]:
+    """Return what one sees of others as numbers for a network: offset, its length, features; F = 0 for S = 0."""
+    if not sight.shape[-1]:
+        return sight
+    return jnp.concatenate([with_length(sight[..., :2]), sight[..., 2:]], axis=-1)
+
+
+def sighted_size(env: Environment) -> int:
+    """Return F of `sighted` in this task."""
+    seen = jax.eval_shape(lambda: env.sight(env.reset(jax.random.key(0), env.default_params())[1]))
+    return jax.eval_shape(sighted, seen).shape[-1]
 
 
 def attend(values: Float[Array, "N M H"], score: Float[Array, "N M"]) -> Float[Array, "N H"]:

@@ -12,11 +12,13 @@ from gacrl.algorithms import build as build_algorithm
 from gacrl.algorithms.contract import Algorithm
 from gacrl.config.checks import require
 from gacrl.config.run import RunConfig
+from gacrl.messages import interventions
 from gacrl.tasks.task import Task
 from gacrl.training import curriculum, footprint
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import mesh_for
 from gacrl.training.trainer import Trainer, TrainState
+from gacrl.types import Intervention
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,16 @@ class Plan:
     """What is otherwise than the settings make one expect."""
 
 
-def make_trainer(config: RunConfig, devices: Mesh | None = None, learns: bool = True) -> Trainer:
+def make_trainer(
+    config: RunConfig,
+    devices: Mesh | None = None,
+    learns: bool = True,
+    intervention: Intervention | None = None,
+) -> Trainer:
     """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`.
 
-    learns: False for policies that are only played: the task then does not move. Raises ConfigError for settings that
-    do not fit each other.
+    learns: False for policies that are only played: the task then does not move. intervention: what happens to their
+    messages; by default what the settings say. Raises ConfigError for settings that do not fit each other.
     """
     task = tasks.find(config.task)
     env, algorithm = task.make(config.env), make_algorithm(config)
@@ -62,6 +69,7 @@ def make_trainer(config: RunConfig, devices: Mesh | None = None, learns: bool = 
         mesh=mesh(config, algorithm) if devices is None else devices,
         for_speed=algorithm.compiled_for_speed,
         watched=tasks.brought(config.task) is not None,
+        intervention=interventions.parse(config.training.intervention) if intervention is None else intervention,
     )
 
 

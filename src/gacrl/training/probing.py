@@ -15,7 +15,7 @@ from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import KNOWN_XLA
 from gacrl.training.trainer import Trainer
-from gacrl.types import Channel, Learner
+from gacrl.types import Learner
 
 
 class ProbeResult(NamedTuple):
@@ -80,7 +80,7 @@ def _values(trainer: Trainer, env: Probe, learner: Learner, params: ProbeParams)
     def value(sign: jax.Array) -> jax.Array:
         state, _ = env.reset(jax.random.key(0), params)
         seen = env.observe(state._replace(sign=sign), params)
-        decision, _ = policy(trainer.memory, seen, jax.random.key(0), Channel())
+        decision, _ = policy(trainer.memory, seen, jax.random.key(0))
         extras = decision.extras
         known = extras["value"] if isinstance(extras, dict) and "value" in extras else jnp.asarray(np.nan)
         return jnp.ravel(known)[0]

@@ -278,6 +278,7 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
         trainer.evaluation_params,
         stream_key("report"),
         SHOWN_EPISODES,
+        trainer.intervention,
         look=references.look_of(task, evaluated_settings(config)),
     )
     folder.episodes.mkdir(exist_ok=True)

@@ -31,7 +31,7 @@ from gacrl.evaluation.metrics import (
 from gacrl.tasks.task import RETURN, Metric
 from gacrl.training.curriculum import Curriculum, CurriculumState
 from gacrl.training.devices import compiler_options, map_seeds, mesh_for, shard_seeds, stack_seeds
-from gacrl.types import Learner, Metrics, PRNGKey, Transition
+from gacrl.types import Intervention, Learner, Metrics, PRNGKey, Transition
 
 
 class TrainState(NamedTuple):
@@ -112,9 +112,11 @@ class Trainer:
         evaluation_params: EnvParams = None,
         metrics: Mapping[str, Metric] = RETURN,
         watched: bool = False,
+        intervention: Intervention | None = None,
     ):
         """params: the task's numbers, in training and as evaluated; None: those of the environments. metrics: the
-        task's. watched: look for observations and rewards that are not finite."""
+        task's. watched: look for observations and rewards that are not finite. intervention: what happens to messages,
+        in training and evaluations alike."""
         self.algorithm = algorithm
         self.env = env
         self.curriculum = curriculum
@@ -128,7 +130,7 @@ class Trainer:
         self.evaluation_params = (
             self.evaluation_env.default_params() if evaluation_params is None else evaluation_params
         )
-        self.metrics, self.watched = metrics, watched
+        self.metrics, self.watched, self.intervention = metrics, watched, intervention
         self.mesh = mesh_for(num_seeds) if mesh is None else mesh
         """The devices that the seeds, and perhaps their environments, are spread over."""
         self.memory = algorithm.initial_memory(env.num_agents)
@@ -155,10 +157,12 @@ class Trainer:
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
         learner_key, start_key, key = jax.random.split(key, 3)
         curriculum, params = self.curriculum.init(params)
-        carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs)
+        learner = self.algorithm.init(learner_key, hyper)
+        policy = self.algorithm.policy(learner, True)
+        carry = rollout.start(self.env, params, self.memory, start_key, self.num_envs, self.intervention, policy)
         tally = jax.vmap(lambda _: no_steps(self.table))(jnp.arange(self.num_envs))
         return TrainState(
-            learner=self.algorithm.init(learner_key, hyper),
+            learner=learner,
             carry=carry,
             env_params=params,
             curriculum=curriculum,
@@ -179,6 +183,7 @@ class Trainer:
             share_out(state.carry),
             rollout_key,
             self.num_steps,
+            self.intervention,
         )
         learner, metrics = self.algorithm.update(state.learner, experience, update_key)
         env_steps = (state.updates + 1) * (self.num_envs * self.num_steps)
@@ -243,6 +248,8 @@ class Trainer:
 
         def one(learner: Learner) -> dict[str, Float[Array, " K"]]:
             policy, key = self.algorithm.policy(learner, explore), stream_key(stream)
-            return evaluate(env, policy, self.memory, params, key, num_episodes, metrics=self.metrics)
+            return evaluate(
+                env, policy, self.memory, params, key, num_episodes, self.intervention, metrics=self.metrics
+            )
 
         return map_seeds(one, self.mesh)(learners)

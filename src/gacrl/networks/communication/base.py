@@ -1,36 +1,48 @@
 """What every kind of message is: a module that takes in what was heard before, and says something now.
 
 A kind has a file of its own, and a line in `gacrl.config.kinds`. It brings what it needs: an inbox, if what is said at
-a step is heard at the next one; its rounds and symbols; and a loss of its own. All messages pass `received`, so that a
-channel silences, delays and scrambles all of them alike.
+a step is heard at the next one; its rounds and symbols; and a loss of its own. All words pass `arriving`, where whoever
+intervenes replaces them, and all edges are those of the neighbourhood, where cut ones are missing.
 """
 
 from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.networks.messages import transmit
-from gacrl.types import Channel, PRNGKey
+from gacrl.networks.arrives import arriving
+from gacrl.types import Arrives, PRNGKey
 
 
 class Neighbourhood(NamedTuple):
-    """Who hears whom, and where the speakers stand."""
+    """Who hears whom in a step, what a listener itself sees of a speaker, and what arrives.
 
-    adjacency: Bool[Array, "N N"]
-    """Entry [i, j]: j's message reaches i."""
-    offsets: Float[Array, "N N 2"]
-    """From i to j; 0 where the task has no space."""
+    Each agent has K speakers: all N agents in order, or its nearest ones. An edge tells nothing else.
+    """
+
+    adjacency: Bool[Array, "N K"]
+    """Entry [i, k]: i hears its k-th speaker."""
+    sight: Float[Array, "N K S"]
+    """What i sees of its k-th speaker, 0 where it does not see it; S = 0 where agents do not see each other."""
+    speakers: Int[Array, "N K"] | None = None
+    """Who the speakers are; None: agents 0 to N − 1."""
+    arrives: Arrives = Arrives()
+
+    def hear(self, words: Float[Array, "N V"]) -> Float[Array, "N K V"]:
+        """Return the words of each agent's speakers."""
+        if self.speakers is not None:
+            return words[self.speakers]
+        return jnp.broadcast_to(words[None], (words.shape[0], *words.shape))
 
 
 class Spoken(NamedTuple):
     """What came of a step's conversation."""
 
     hidden: Float[Array, "N H"]
-    message: Float[Array, "N V"] | None
+    messages: Float[Array, "R N V"] | None
+    """What each agent sent in each round."""
     inbox: Any = ()
     """What is carried to the next step."""
     entropy: Float[Array, " N"] | float = 0.0
@@ -40,22 +52,19 @@ class Spoken(NamedTuple):
 
 
 class Communication(eqx.Module):
-    """A kind of message. It is made by `Kind(NetworkConfig, key, gain)`; gain: of orthogonal weights, where given."""
+    """A kind of message. It is made by `Kind(env, NetworkConfig, key, gain)`; gain: of orthogonal weights, if given."""
 
     sends_symbols: ClassVar[bool] = False
     """Whether what is played is one symbol of `vocabulary` for each round."""
+    heard_late: ClassVar[bool] = False
+    """Whether what is said at a step is heard at the next one."""
 
     def empty_inbox(self, num_agents: int) -> Any:
         """What nobody has said anything into; () for a kind that is heard in the step in which it is said."""
         return ()
 
     def hear(
-        self,
-        hidden: Float[Array, "N H"],
-        inbox: Any,
-        near: Neighbourhood,
-        channel: Channel,
-        key: PRNGKey | None,
+        self, hidden: Float[Array, "N H"], inbox: Any, near: Neighbourhood, key: PRNGKey | None
     ) -> Float[Array, "N H"]:
         """Take in what was said at the step before."""
         return hidden
@@ -65,7 +74,6 @@ class Communication(eqx.Module):
         self,
         hidden: Float[Array, "N H"],
         near: Neighbourhood,
-        channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
@@ -74,19 +82,13 @@ class Communication(eqx.Module):
 
 
 def received(
-    message: Float[Array, "N V"], channel: Channel, key: PRNGKey | None, speakers: Int[Array, "N K"] | None = None
+    words: Float[Array, "N V"], near: Neighbourhood, number: int = 0, rounds: int = 1
 ) -> Float[Array, "N K V"]:
-    """Entry [i, k]: the message of i's k-th speaker as it reaches i; of all agents for None."""
-    if channel == Channel():
-        if speakers is not None:
-            return message[speakers]
-        return jnp.broadcast_to(message[None], (message.shape[0], *message.shape))
-    key = None if key is None else jax.random.fold_in(key, 1_000)
-    received = jnp.moveaxis(transmit(message.T, channel, key)[0], 0, -1)
-    return received if speakers is None else jnp.take_along_axis(received, speakers[..., None], axis=1)
+    """Return what each agent receives of its speakers in round `number` (from 0) of so many."""
+    return near.hear(arriving(words, near.arrives, number, rounds))
 
 
-def neighbour_mean(received: Float[Array, "N N V"], adjacency: Bool[Array, "N N"]) -> Float[Array, "N V"]:
-    """Over each agent's neighbours; 0 for an agent without any."""
+def neighbour_mean(received: Float[Array, "N K V"], adjacency: Bool[Array, "N K"]) -> Float[Array, "N V"]:
+    """Average over each agent's neighbours; 0 for an agent without any."""
     weight = adjacency / jnp.maximum(adjacency.sum(1, keepdims=True), 1)
     return jnp.einsum("ij,ijv->iv", weight, received)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
+from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, neighbour_mean, received
 from gacrl.networks.layers import Linear
-from gacrl.types import Channel, PRNGKey
+from gacrl.types import PRNGKey
 
 
 class CommNet(Communication):
@@ -16,7 +17,7 @@ class CommNet(Communication):
     own: tuple[Linear, ...]
     heard: tuple[Linear, ...]
 
-    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+    def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         own_key, heard_key = jax.random.split(key)
         width, rounds = config.width, config.rounds
         self.own = tuple(Linear(width, width, k, gain) for k in jax.random.split(own_key, rounds))
@@ -26,14 +27,13 @@ class CommNet(Communication):
         self,
         hidden: Float[Array, "N H"],
         near: Neighbourhood,
-        channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        message = hidden
-        for own, heard in zip(self.own, self.heard, strict=True):
-            message = hidden
-            told = received(message, channel, key)
+        said = []
+        for number, (own, heard) in enumerate(zip(self.own, self.heard, strict=True)):
+            said.append(hidden)
+            told = received(hidden, near, number, len(self.own))
             hidden = jnp.tanh(own(hidden) + heard(neighbour_mean(told, near.adjacency)))
-        return Spoken(hidden, message)
+        return Spoken(hidden, jnp.stack(said))

@@ -4,58 +4,52 @@ import math
 from abc import abstractmethod
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
+from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
-from gacrl.networks.graph import attend, with_length
+from gacrl.networks.graph import attend, sighted, sighted_size
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import gumbel_softmax, most_likely_symbol
-from gacrl.types import Channel, PRNGKey
+from gacrl.types import PRNGKey
 
 
 class Symbols(Communication):
     """Rounds of messages: one symbol for each agent and round; what a symbol is, kinds of this say.
 
     The first round's symbol is made of the agent's code, where it has one, as the paper's is of its latent; those
-    of later rounds of what it knows by then. A receiver knows where the speaker stands: an edge's embedding is of
-    the symbol and the offset. Over the neighbours: the mean, weighted by attention (scaled dot product of the
-    receiver's query and the edge's embedding).
-
-    With `nearest_agents` each agent hears its nearest neighbours alone, and the cost grows with N · nearest_agents.
+    of later rounds of what it knows by then. An edge's embedding is of the symbol and of what the receiver itself sees
+    of the speaker. Over the neighbours: the mean, weighted by attention (scaled dot product of the receiver's query
+    and the edge's embedding).
     """
 
     encode: tuple[Linear, ...]
     edge: tuple[Mlp, ...]
     query: tuple[Linear, ...]
     merge: tuple[Linear, ...]
-    nearest: int | None = eqx.field(static=True)
 
-    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+    def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, narrow, symbols = config.width, config.width // 2, config.vocabulary
         encode, edge, query, merge = jax.random.split(key, (4, config.rounds))
         first = width if config.latent == "none" else config.latent_size
         sizes = (first, *[width] * (config.rounds - 1))
         self.encode = tuple(Linear(i, symbols, k, gain) for i, k in zip(sizes, encode, strict=True))
-        self.edge = tuple(Mlp(symbols + 3, (narrow,), k, gain) for k in edge)
+        self.edge = tuple(Mlp(symbols + sighted_size(env), (narrow,), k, gain) for k in edge)
         self.query = tuple(Linear(width, narrow, k, gain) for k in query)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
-        self.nearest = config.nearest_agents
 
     def speak(
         self,
         hidden: Float[Array, "N H"],
         near: Neighbourhood,
-        channel: Channel,
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        edges, speakers = _edges(near, self.nearest)
-        where, message, entropy = with_length(edges.offsets), None, jnp.zeros(hidden.shape[0])
+        seen, said, entropy = sighted(near.sight), [], jnp.zeros(hidden.shape[0])
         for number, (encode, edge, query, merge) in enumerate(
             zip(self.encode, self.edge, self.query, self.merge, strict=True)
         ):
@@ -63,12 +57,13 @@ class Symbols(Communication):
             log_symbol = jax.nn.log_softmax(logits)
             entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / len(self.encode)
             draw = None if key is None else jax.random.fold_in(key, number)
-            message = self.symbol(logits, draw, temperature)
-            edges_heard = edge(jnp.concatenate([received(message, channel, key, speakers), where], axis=-1))
+            said.append(self.symbol(logits, draw, temperature))
+            words = received(said[-1], near, number, len(self.encode))
+            edges_heard = edge(jnp.concatenate([words, seen], axis=-1))
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
-            heard = attend(edges_heard, jnp.where(edges.adjacency, score, -jnp.inf))
+            heard = attend(edges_heard, jnp.where(near.adjacency, score, -jnp.inf))
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
-        return Spoken(hidden, message, (), entropy)
+        return Spoken(hidden, jnp.stack(said), (), entropy)
 
     @abstractmethod
     def symbol(
@@ -99,13 +94,3 @@ class SoftSymbols(Symbols):
         if key is None:
             return jax.nn.softmax(logits / temperature)
         return gumbel_softmax(logits, jax.random.gumbel(key, logits.shape), temperature)
-
-
-def _edges(near: Neighbourhood, nearest: int | None) -> tuple[Neighbourhood, Int[Array, "N K"] | None]:
-    """The edges to each agent from its nearest neighbours, and who those are; all edges and None for no limit."""
-    if nearest is None or nearest >= near.adjacency.shape[0]:
-        return near, None
-    squared = jnp.where(near.adjacency, jnp.square(near.offsets).sum(-1), jnp.inf)
-    speakers = jax.lax.top_k(-squared, nearest)[1]
-    offsets = jnp.take_along_axis(near.offsets, speakers[..., None], axis=1)
-    return Neighbourhood(jnp.take_along_axis(near.adjacency, speakers, axis=1), offsets), speakers

@@ -256,6 +256,20 @@ class Spread(SpreadSettings, Environment):
         there = (jnp.square(offsets).sum(-1) > 0 for offsets in (landmarks, agents))
         return Entities(own, landmarks, agents, *there)
 
+    def sight(self, observation: Observation) -> Float[Array, "N N S"]:
+        """Return the offset to each agent in sight; 0 of the others."""
+        positions, count = observation.positions, self.num_agent_neighbors
+        assert positions is not None
+        if count == 0:
+            return jnp.zeros((self.num_agents, self.num_agents, 0))
+        offsets = positions[None, :, :] - positions[:, None, :]
+        if count is None or count >= self.num_agents - 1:
+            return offsets
+        there = observation.agent_mask[None, :] & ~jnp.eye(self.num_agents, dtype=bool)
+        distance = jnp.where(there, jnp.square(offsets).sum(-1), jnp.inf)
+        farthest = -jax.lax.top_k(-distance, count)[0][:, -1:]
+        return jnp.where((distance <= farthest)[..., None] & there[..., None], offsets, 0.0)
+
     @property
     def num_symmetries(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return NUM_SYMMETRIES

@@ -27,7 +27,7 @@ from gacrl.tasks.spread.environment import (
     reflect,
     unpack_state,
 )
-from gacrl.types import Actor, Channel, Decision, Memory, Observation, PRNGKey
+from gacrl.types import Actor, Decision, Memory, Observation, PRNGKey
 
 SIGHT = 5
 """The local policy sees this many nearest landmarks, and as many nearest agents."""
@@ -46,7 +46,7 @@ def oracle(env: Spread) -> Actor:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
     params = env.default_params()
 
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if observation.state is None:
             raise ValueError("The oracle needs an environment that puts its state into the observation.")
         state = unpack_state(observation.state, env.num_agents)
@@ -75,7 +75,7 @@ def oracle(env: Spread) -> Actor:
 def local(env: Spread) -> Actor:
     """Each agent decides anew in every step, from the nearest landmarks and agents alone."""
 
-    def policy(memory: Memory, observation: Observation, key: PRNGKey, channel: Channel):
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if observation.state is None:
             raise ValueError("The local policy needs an environment that puts its state into the observation.")
         state = unpack_state(observation.state, env.num_agents)

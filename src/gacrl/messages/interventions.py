@@ -1,0 +1,193 @@
+"""What can be done to messages on their way: silence, swap, scramble, drop, delay and noise, and words of one's own.
+
+Each makes an `Intervention`: it says what arrives, `gacrl.rollout` lets it arrive, in training, evaluation and
+recording alike. Where the words of a step are needed before they arrive, the agents are asked round by round, since
+what they say in a round depends on what they heard in the one before.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl.config.checks import require, unknown
+from gacrl.errors import ConfigError
+from gacrl.types import Arrives, Intervention, PRNGKey, Words
+
+Ask: TypeAlias = Callable[[Arrives], Words]
+RoundOfWords: TypeAlias = Float[Array, "E N V"]
+
+
+def silence(agents: Sequence[int] | None = None) -> Intervention:
+    """Nobody hears these agents, counted from 0; by default nobody hears anybody."""
+
+    def init(words: Words) -> Any:
+        _require_agents("silence", agents or (), words)
+        return ()
+
+    def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        num_envs, _, num_agents, _ = _shape(ask)
+        muted = jnp.ones(num_agents, bool)
+        if agents is not None:
+            muted = jnp.zeros(num_agents, bool).at[jnp.asarray(agents, int)].set(True)
+        return Arrives(kept=jnp.broadcast_to(~muted, (num_envs, num_agents, num_agents)))
+
+    return Intervention("silence", arrives, init)
+
+
+def swap(one: int, other: int) -> Intervention:
+    """Each of the two agents is heard with the words of the other."""
+
+    def init(words: Words) -> Any:
+        _require_agents("swap", (one, other), words)
+        return ()
+
+    def swapped(said: RoundOfWords) -> RoundOfWords:
+        return said.at[:, (one, other)].set(said[:, (other, one)])
+
+    return Intervention("swap", _round_by_round(swapped), init)
+
+
+def scramble() -> Intervention:
+    """Every agent is heard with its own words from the next of the episodes that are played side by side.
+
+    The words keep their frequencies and their order in time, and say nothing about what goes on here. Raises
+    ConfigError for a single episode.
+    """
+
+    def init(words: Words) -> Any:
+        require(words.shape[0] > 1, "to scramble messages takes at least two episodes side by side")
+        return ()
+
+    return Intervention("scramble", _round_by_round(lambda said: jnp.roll(said, 1, axis=0)), init)
+
+
+def drop(probability: float) -> Intervention:
+    """Each edge loses what is said along it in a step, all rounds of it, with this probability."""
+    _require_share("drop", probability)
+
+    def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        num_envs, _, num_agents, _ = _shape(ask)
+        return Arrives(kept=jax.random.bernoulli(key, 1.0 - probability, (num_envs, num_agents, num_agents)))
+
+    return Intervention("drop", arrives)
+
+
+def noise(probability: float) -> Intervention:
+    """Each word is replaced by a symbol drawn at random with this probability."""
+    _require_share("noise", probability)
+
+    def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        *words, symbols = _shape(ask)
+        replaced_key, symbol_key = jax.random.split(key)
+        random = jax.random.randint(symbol_key, words, 0, symbols)
+        return Arrives(jax.nn.one_hot(random, symbols), jax.random.bernoulli(replaced_key, probability, words))
+
+    return Intervention("noise", arrives)
+
+
+class _Late(NamedTuple):
+    """Words on their way."""
+
+    words: Float[Array, "K E R N V"]
+    """What was said in each of the K steps before, the last one first."""
+    step: Int[Array, " E"]
+    """Steps since the episode began."""
+
+
+def delay(steps: int) -> Intervention:
+    """Words arrive this many steps after they were said; in an episode's first steps nothing arrives."""
+    fits = steps == int(steps) and 1 <= steps <= 1_000
+    require(fits, f"delay must be a whole number of steps between 1 and 1000, not {steps!r}")
+
+    def init(words: Words) -> _Late:
+        return _Late(jnp.zeros((steps, *words.shape)), jnp.zeros(words.shape[0], jnp.int32))
+
+    def arrives(state: _Late, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        num_envs, _, num_agents, _ = state.words.shape[1:]
+        there = jnp.where(first, 0, state.step) >= steps
+        values = jnp.where(there[:, None, None, None], state.words[-1], 0.0)
+        return Arrives(values, kept=jnp.broadcast_to(there[:, None, None], (num_envs, num_agents, num_agents)))
+
+    def follow(state: _Late, said: Words, first: Bool[Array, " E"]) -> _Late:
+        return _Late(jnp.concatenate([said[None], state.words[:-1]]), jnp.where(first, 0, state.step) + 1)
+
+    return Intervention("delay", arrives, init, follow)
+
+
+INTERVENTIONS: dict[str, tuple[Callable[..., Intervention], str]] = {
+    "silence": (lambda *agents: silence(agents or None), "silence [AGENT …]"),
+    "swap": (swap, "swap AGENT AGENT"),
+    "scramble": (scramble, "scramble"),
+    "drop": (drop, "drop PROBABILITY"),
+    "delay": (delay, "delay STEPS"),
+    "noise": (noise, "noise PROBABILITY"),
+}
+"""By name: what makes one, and how it is written."""
+
+
+def parse(text: str) -> Intervention | None:
+    """Read `silence`, `silence 0 2`, `swap 0 1`, `scramble`, `drop 0.2`, `delay 3` or `noise 0.1`; None for nothing.
+
+    Raises ConfigError for anything else.
+    """
+    if not text.strip():
+        return None
+    name, *words = text.split()
+    require(name in INTERVENTIONS, unknown("intervention", name, INTERVENTIONS))
+    make, written = INTERVENTIONS[name]
+    try:
+        return make(*(float(word) if name in ("drop", "noise") else int(word) for word in words))
+    except ConfigError:
+        raise
+    except (TypeError, ValueError):
+        raise ConfigError(f"{text!r} is no intervention: write it as `{written}`") from None
+
+
+def example(text: str, words: Callable[[], tuple[int, ...] | None]) -> Arrives:
+    """Return zeros in the shapes of what arrives in one environment where `parse(text)` intervenes.
+
+    words: the shape [R, N, V] of what is said in a step; None where nothing is.
+    """
+    intervention = parse(text)
+    if intervention is None:
+        return Arrives()
+    shape = words()
+    require(shape is not None, f"the agents say nothing: there are no messages to {intervention.name}")
+
+    def one() -> Arrives:
+        said, first = jnp.zeros((2, *(shape or ()))), jnp.zeros(2, bool)
+        return intervention.arrives(intervention.init(said), lambda _: said, first, jax.random.key(0))
+
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), jax.eval_shape(one))
+
+
+def _round_by_round(change: Callable[[RoundOfWords], RoundOfWords]) -> Callable[..., Arrives]:
+    """What arrives of each round is `change` of what is said in it, by agents that heard the rounds before so."""
+
+    def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        shape = _shape(ask)
+        values, replaced = jnp.zeros(shape), jnp.zeros(shape[:3], bool)
+        for number in range(shape[1]):
+            said = ask(Arrives(values, replaced))[:, number]
+            values, replaced = values.at[:, number].set(change(said)), replaced.at[:, number].set(True)
+        return Arrives(values, replaced)
+
+    return arrives
+
+
+def _shape(ask: Ask) -> tuple[int, int, int, int]:
+    """[E, R, N, V]; nothing is computed."""
+    return jax.eval_shape(ask, Arrives()).shape
+
+
+def _require_agents(name: str, agents: Sequence[int], words: Words) -> None:
+    num_agents = words.shape[2]
+    strangers = [agent for agent in agents if not 0 <= agent < num_agents]
+    require(not strangers, f"{name}: there are the agents 0 to {num_agents - 1}, and no agent {strangers[:1]}")
+
+
+def _require_share(name: str, probability: float) -> None:
+    require(0.0 <= probability <= 1.0, f"{name} must be a probability between 0 and 1, not {probability!r}")
