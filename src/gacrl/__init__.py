@@ -1,8 +1,9 @@
 """Learning to coordinate by communicating over a graph.
 
     import gacrl
-    run = gacrl.train(gacrl.preset("paper"), seed=0)
-    policy = gacrl.load_policy(run.folder)
+    run = gacrl.train("gacrl", env="reference", seed=0)
+    silenced = gacrl.evaluate(run, arrives=gacrl.silence())
+    policy = run.policy()
 
 The names below load on first use, so that `import gacrl` itself costs nothing.
 """
@@ -12,51 +13,80 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gacrl.algorithms.contract import Algorithm
-    from gacrl.api import make_env, train
-    from gacrl.config.presets import preset
+    from gacrl.api import Run, Trainer, evaluate, iterate, make_env, train, trainer
+    from gacrl.config.files import preset
     from gacrl.config.run import RunConfig
     from gacrl.envs.environment import Environment, TimeStep, observe
     from gacrl.errors import ConfigError, UserError
+    from gacrl.evaluation.summary import Estimate
+    from gacrl.messages.interventions import delay, drop, noise, scramble, silence, swap
     from gacrl.play import LoadedPolicy, load_policy
     from gacrl.tasks.task import Metric, Task
-    from gacrl.training.session import Run, Watcher
+    from gacrl.training.watching import Watcher
+    from gacrl.types import Arrives, Intervention
 
 _HOMES = {
     "Algorithm": "gacrl.algorithms.contract",
+    "Arrives": "gacrl.types",
     "ConfigError": "gacrl.errors",
     "Environment": "gacrl.envs.environment",
+    "Estimate": "gacrl.evaluation.summary",
+    "Intervention": "gacrl.types",
     "LoadedPolicy": "gacrl.play",
     "Metric": "gacrl.tasks.task",
-    "Run": "gacrl.training.session",
+    "Run": "gacrl.api",
     "RunConfig": "gacrl.config.run",
     "Task": "gacrl.tasks.task",
     "TimeStep": "gacrl.envs.environment",
+    "Trainer": "gacrl.api",
     "UserError": "gacrl.errors",
-    "Watcher": "gacrl.training.session",
+    "Watcher": "gacrl.training.watching",
+    "delay": "gacrl.messages.interventions",
+    "drop": "gacrl.messages.interventions",
+    "evaluate": "gacrl.api",
+    "iterate": "gacrl.api",
     "load_policy": "gacrl.play",
     "make_env": "gacrl.api",
+    "noise": "gacrl.messages.interventions",
     "observe": "gacrl.envs.environment",
-    "preset": "gacrl.config.presets",
+    "preset": "gacrl.config.files",
+    "scramble": "gacrl.messages.interventions",
+    "silence": "gacrl.messages.interventions",
+    "swap": "gacrl.messages.interventions",
     "train": "gacrl.api",
+    "trainer": "gacrl.api",
 }
 
 __all__ = [  # the keys of _HOMES, spelled out for type checkers
     "Algorithm",
+    "Arrives",
     "ConfigError",
     "Environment",
+    "Estimate",
+    "Intervention",
     "LoadedPolicy",
     "Metric",
     "Run",
     "RunConfig",
     "Task",
     "TimeStep",
+    "Trainer",
     "UserError",
     "Watcher",
+    "delay",
+    "drop",
+    "evaluate",
+    "iterate",
     "load_policy",
     "make_env",
+    "noise",
     "observe",
     "preset",
+    "scramble",
+    "silence",
+    "swap",
     "train",
+    "trainer",
 ]
 
 

@@ -1,10 +1,10 @@
 """Trained and scripted policies as things to hold: what `RUN` names on the command line and in Python."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,12 @@ from jaxtyping import Array, Float
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.config.checks import unknown
+from gacrl.config.checks import require, unknown
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment
 from gacrl.errors import UserError
 from gacrl.evaluation.references import FLOORS, noop, playable, random
+from gacrl.tasks import own
 from gacrl.tasks.task import Task
 from gacrl.training import build, checkpoint, session
 from gacrl.training.devices import one_seed, rows
@@ -25,7 +26,7 @@ from gacrl.training.keeper import Acting
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Parent
 from gacrl.training.trainer import Trainer
-from gacrl.types import Memory, Policy
+from gacrl.types import Intervention, Memory, Policy
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,15 @@ def open_run(
     run: str | Path,
     change: Callable[[Any], Any] = lambda settings: settings,
     warn: Callable[[str], None] = lambda sentence: None,
+    intervention: Intervention | None = None,
 ) -> TrainedRun:
     """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
 
     `@best` behind it takes the parameters that scored best while training, instead of the newest.
 
-    change: what to alter about the task's settings. Raises UserError for a folder that holds no run, a task that is
-    not at hand, or parameters that do not fit the task.
+    change: what to alter about the task's settings. intervention: what happens to messages; by default what did while
+    training. Raises UserError for a folder that holds no run, a task that is not at hand, or parameters that do not
+    fit the task.
     """
     path, member, kind = _split(str(run))
     folder = RunFolder.open(path)
@@ -74,7 +77,7 @@ def open_run(
     evaluation = replace(config.evaluation, horizon=None)
     changed = replace(config, env=change(config.env), evaluation=evaluation)
     _require_playable(path, config, changed)
-    trainer = build.make_trainer(changed, learns=False)
+    trainer = build.make_trainer(changed, learns=False, intervention=intervention)
     found, warnings = checkpoint.newest(folder.checkpoints, kind)
     for warning in warnings:
         warn(warning)
@@ -82,7 +85,7 @@ def open_run(
     if member is not None:
         _require_member(path, member, config.num_seeds)
         changed = replace(changed, seed=config.seed + member, num_seeds=1)
-        trainer = build.make_trainer(changed, learns=False)
+        trainer = build.make_trainer(changed, learns=False, intervention=intervention)
         learners = rows(learners, member, member + 1)
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
@@ -162,7 +165,7 @@ class LoadedPolicy:
 
     >>> policy = gacrl.load_policy("runs/paper-1")
     >>> policy.reset(seed=0)
-    >>> actions = policy(observations)  # [N, O] -> [N]
+    >>> actions = policy(observations)  # [N, O] -> [N], or {agent: observation} -> {agent: action}
     """
 
     def __init__(self, env: Environment, policies: dict[bool, Policy], initial_memory: Memory):
@@ -170,6 +173,9 @@ class LoadedPolicy:
         self.env = env
         self._initial_memory = initial_memory
         self._act = {greedy: jax.jit(policy) for greedy, policy in policies.items()}
+        seen = jax.eval_shape(lambda: env.reset(jax.random.key(0), env.default_params())[1])
+        self._state = None if seen.state is None else jnp.zeros(seen.state.shape)
+        """For critics, whose values nobody asks for: observations do not tell the state."""
         self.messages: np.ndarray | None = None
         """What each agent sent in each round of the last step, [R, N, V]; None where the policy says nothing."""
         self.reset()
@@ -179,31 +185,49 @@ class LoadedPolicy:
         self._memory = self._initial_memory
         self._key = jax.random.key(seed)
 
-    def __call__(self, observations: Float[Array | np.ndarray, "N O"], greedy: bool = True) -> np.ndarray:
-        """The actions of the N agents. Raises ValueError for observations of another shape."""
+    @overload
+    def __call__(self, observations: Mapping[Any, Any], greedy: bool = True) -> dict[Any, Any]: ...
+    @overload
+    def __call__(self, observations: Float[Array | np.ndarray, "N O"], greedy: bool = True) -> np.ndarray: ...
+    def __call__(self, observations: Any, greedy: bool = True) -> Any:
+        """Return the actions of the N agents: an array, or as PettingZoo has them a dictionary.
+
+        Agents of a dictionary are taken in its order, and must all be in it. Raises ConfigError for observations of
+        another shape, or that are not finite.
+        """
+        named = isinstance(observations, Mapping)
+        rows = list(observations.values()) if named else observations
+        features = self.env.stack(rows) if named else np.asarray(rows, np.float32)
         expected = (self.env.num_agents, self.env.observation_size)
-        observations = jnp.asarray(observations, jnp.float32)
-        if observations.shape != expected:
-            raise ValueError(f"observations must be [agents, numbers] = {expected}, not {observations.shape}")
+        require(
+            features.shape == expected,
+            f"observations must be [agents, numbers] = {list(expected)}, not {list(features.shape)}",
+        )
+        odd = np.flatnonzero(~np.isfinite(features).all(1))
+        require(not odd.size, f"what agent {odd[0] if odd.size else 0} sees holds a number that is not finite")
         self._key, key = jax.random.split(self._key)
-        seen = self.env.from_features(observations)
+        seen = self.env.from_features(jnp.asarray(features))._replace(state=self._state)
         decision, self._memory = self._act[greedy](self._memory, seen, key)
         self.messages = None if decision.messages is None else np.asarray(decision.messages)
-        return np.asarray(decision.action)
+        actions = np.asarray(decision.action)
+        return dict(zip(observations, self.env.unstack(actions), strict=True)) if named else actions
 
 
-def load_policy(run: str | Path) -> LoadedPolicy:
-    """The policy of a run: its folder, `FOLDER@k`, or `random` and `noop`.
+def load_policy(run: Any, env: Any = None, **settings: Any) -> LoadedPolicy:
+    """Load the policy of a run: a `Run`, its folder, `FOLDER@k`, `pretrained:NAME`, or `random` and `noop`.
 
-    Raises UserError where there is no such run. Other scripted policies need the exact state, which observations
-    alone do not give.
+    env: the task of a scripted policy; by default `spread`. settings: of the task, where they differ from those of
+    training (num_agents=10). Raises UserError where there is no such run, and ConfigError for a setting that its task
+    does not have. Other scripted policies need the exact state, which observations alone do not give.
     """
-    if str(run) in FLOORS:
-        env = tasks.find(tasks.DEFAULT).make(tasks.default_settings(tasks.DEFAULT))
-        actor = {"random": random, "noop": noop}[str(run)](env)
+    name = str(getattr(run, "folder", run))
+    if name in FLOORS:
+        task, base = own.bring(tasks.DEFAULT if env is None else env)
+        env = tasks.find(task).make(configuration.changed(base, settings))
+        actor = {"random": random, "noop": noop}[name](env)
         return LoadedPolicy(env, dict.fromkeys((True, False), actor.policy), actor.initial_memory)
-    if str(run) in playable(tasks.find(tasks.DEFAULT)):
-        raise UserError(f"{run} needs the exact state, not observations: play it with `gacrl evaluate {run}`")
-    opened = open_run(run)
+    if name in playable(tasks.find(tasks.DEFAULT)):
+        raise UserError(f"{name} needs the exact state, not observations: play it with `gacrl evaluate {name}`")
+    opened = open_run(name, lambda trained: configuration.changed(trained, settings))
     policies = {greedy: opened.policy(0, not greedy) for greedy in (True, False)}
     return LoadedPolicy(opened.env, policies, opened.trainer.memory)

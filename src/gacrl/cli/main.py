@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from gacrl.experiments.paper.reproduce import Reproduction
     from gacrl.experiments.search import Search
     from gacrl.experiments.study import Watch
-    from gacrl.training.session import Run, Watcher
+    from gacrl.training.session import Ended
+from gacrl.training.watching import Watcher
 
 OVERVIEW = """\
 gacrl: learning to coordinate by communicating over a graph
@@ -156,7 +157,7 @@ def _train(words: _Words) -> int:
     if env_steps is not None:
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
-    def start(watcher: "Watcher") -> "Run":
+    def start(watcher: "Watcher") -> "Ended":
         from gacrl import play
         from gacrl.training import session
 
@@ -187,7 +188,7 @@ def _resume(words: list[str]) -> int:
         env_steps = config.training.env_steps + asked.extend
         config = replace(config, training=replace(config.training, env_steps=env_steps))
 
-    def resume(watcher: "Watcher") -> "Run":
+    def resume(watcher: "Watcher") -> "Ended":
         from gacrl.training import session
 
         return session.resume(asked.run, asked.extend, watcher)
@@ -214,7 +215,7 @@ def _diagnose(asked: "Resume") -> int:
     return 0
 
 
-def _watched(work: Callable[["Watcher"], "Run"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
+def _watched(work: Callable[["Watcher"], "Ended"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
     cluster.check()
     from gacrl.cli.terminal import TerminalWatcher

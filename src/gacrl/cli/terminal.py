@@ -14,11 +14,13 @@ from rich.text import Text
 
 from gacrl import tasks
 from gacrl.config.run import RunConfig
+from gacrl.training.build import Plan
 from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.footprint import readable
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Plan, Run, Watcher
+from gacrl.training.session import Ended
+from gacrl.training.watching import Watcher
 
 
 class TerminalWatcher:
@@ -97,7 +99,7 @@ class TerminalWatcher:
         else:
             self._print(line)
 
-    def report(self, run: Run) -> None:
+    def report(self, run: Ended) -> None:
         """The end: what was reached, the paper's tables where they apply, and where everything lies."""
         self._live.stop()
         if self.quiet:
@@ -123,7 +125,7 @@ class TerminalWatcher:
                 f"episodes   {run.folder / 'episodes'}; no picture: {run.config.task} does not say where things are"
             )
 
-    def _paper_tables(self, run: Run) -> None:
+    def _paper_tables(self, run: Ended) -> None:
         from gacrl.experiments.paper import tables as paper_tables
 
         if not paper_tables.apply_to(run.config):

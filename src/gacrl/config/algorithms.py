@@ -101,6 +101,16 @@ class NetworkConfig:
     """Rounds of messages within a step (CommNet, symbols)."""
     vocabulary: int = 8
     """Symbols of a message; units of a DIAL message."""
+    symbols: Literal["straight_through", "soft"] = "straight_through"
+    """Discrete symbols while learning: one-hot with the gradient of the soft sample, or soft; one-hot when played."""
+    symbol_noise: float = 1.0
+    """Scale of the Gumbel noise on symbols while learning."""
+    speaker_identity: bool = False
+    """A listener is told which agent a message comes from; ties the network to the number of agents."""
+    second_look: bool = False
+    """After the messages, attend once more to the landmarks in sight, by what was heard (graph torso)."""
+    look_sharpness: float = 4.0
+    """Factor of the second look's attention scores."""
     dial_noise: float = 2.0
     """Standard deviation of the noise on DIAL's units while learning."""
     radius: float = 1.5
@@ -116,9 +126,13 @@ class NetworkConfig:
         between("algorithm.network", self, 1, 65_536, "width", "vocabulary", "latent_size")
         between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         between("algorithm.network", self, 1, 100, "depth", "rounds")
-        between("algorithm.network", self, 0.0, 100.0, "dial_noise")
+        between("algorithm.network", self, 0.0, 100.0, "dial_noise", "symbol_noise", "look_sharpness")
         between("algorithm.network", self, 0.0, 1e6, "radius")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")
+        require(
+            self.torso == "graph" or not self.second_look,
+            "algorithm.network.second_look needs algorithm.network.torso graph, which tells landmarks apart",
+        )
         kind = self.communication
         require(kind in COMMUNICATION, unknown("algorithm.network.communication", kind, COMMUNICATION))
 

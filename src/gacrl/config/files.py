@@ -9,12 +9,31 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gacrl import tasks
+from gacrl.config import presets
 from gacrl.config.algorithms import ALGORITHMS
 from gacrl.config.checks import require, unknown
 from gacrl.config.former import converted
-from gacrl.config.presets import DEFAULT_PRESET, preset
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, reason
+
+
+def preset(name: str = presets.DEFAULT_PRESET, **changes: Any) -> RunConfig:
+    """Return the settings of a preset, with these changes.
+
+    >>> gacrl.preset("gacrl", **{"algorithm.learning_rate": 1e-3, "env.num_agents": 5})
+
+    Raises ConfigError for a preset or a setting that there is not, with the nearest name, and for a value that does
+    not fit.
+    """
+    base = presets.preset(_text(name, "the preset"))
+    data: dict[str, Any] = {}
+    for dotted, value in changes.items():
+        *sections, setting = dotted.split(".")
+        inner = data
+        for section in sections:
+            inner = inner.setdefault(section, {})
+        inner[setting] = value
+    return from_dict(data, base)
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
@@ -34,7 +53,7 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
     Raises ConfigError for an unknown key (with the nearest known one), a value of the wrong type, or a task that is
     not at hand.
     """
-    named = preset(_text(data.get("preset", DEFAULT_PRESET), "preset"))
+    named = presets.preset(_text(data.get("preset", presets.DEFAULT_PRESET), "preset"))
     base = named if base is None else base
     data = converted(data)
     if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
@@ -59,6 +78,11 @@ def on_task(config: RunConfig, name: str) -> RunConfig:
     """
     settings = tasks.default_settings(name)
     return config if name == config.task else replace(config, task=name, env=settings)
+
+
+def changed(settings: Any, changes: Mapping[str, Any]) -> Any:
+    """Return a task's settings with these changes. Raises ConfigError for a setting it does not have."""
+    return _merge(settings, changes, "env.")
 
 
 def load(path: Path, base: RunConfig | None = None) -> RunConfig:

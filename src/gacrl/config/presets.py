@@ -181,7 +181,7 @@ DEFAULT_PRESET = "gacrl"
 
 
 def preset(name: str = DEFAULT_PRESET) -> RunConfig:
-    """The settings of a preset. Raises ConfigError with the nearest name for one there is not."""
+    """Return the settings of a preset. Raises ConfigError with the nearest name for one there is not."""
     if name not in PRESETS:
         raise ConfigError(unknown("preset", name, PRESETS, "see `gacrl presets`"))
     return PRESETS[name][1]

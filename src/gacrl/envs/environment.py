@@ -6,8 +6,10 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from gacrl.config.checks import require
 from gacrl.types import Entities, Metrics, Observation, PRNGKey
 
 EnvState: TypeAlias = Any
@@ -70,6 +72,23 @@ class Environment(ABC):
         """The observation around bare feature vectors, as other programs hand them out: everyone is there, and may do
         everything."""
         return observe(features, num_actions=self.num_actions)
+
+    def stack(self, rows: Sequence[Any]) -> Float[np.ndarray, "N O"]:
+        """Stack what the agents see, as other programs hand it out one by one.
+
+        Raises ConfigError where it does not fit.
+        """
+        rows = [np.asarray(row, np.float32).reshape(-1) for row in rows]
+        sizes = [row.size for row in rows]
+        require(
+            sizes == [self.observation_size] * self.num_agents,
+            f"observations must hold {self.observation_size} numbers for each of {self.num_agents} agents, not {sizes}",
+        )
+        return np.stack(rows)
+
+    def unstack(self, actions: Array | np.ndarray) -> list[Any]:
+        """Return the agents' actions as other programs take them, one by one."""
+        return [int(action) for action in actions] if actions.ndim == 1 else list(np.asarray(actions))
 
     def entities(self, observation: Observation) -> Entities:
         """Take apart what is seen, for graph networks. By default an agent is alone with its features."""

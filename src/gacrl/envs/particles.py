@@ -95,3 +95,15 @@ def integrate(
     """One step: positions move with the old velocity, then velocities are damped and pushed (mass 1)."""
     moved = positions + velocities * physics.time_step
     return moved, velocities * (1 - physics.damping) + forces * physics.time_step
+
+
+def coast(
+    positions: Float[Array, "N 2"], velocities: Float[Array, "N 2"], physics: Physics
+) -> tuple[Float[Array, "N 2"], Float[Array, ""] | float]:
+    """Return positions three steps ahead without any push, and how far one of full force, now, moves them.
+
+    A push changes the velocity after the first step; in the third, damping has taken its share.
+    """
+    kept, dt = 1 - physics.damping, physics.time_step
+    effect = dt * (1 + kept)
+    return positions + (dt + effect * kept) * velocities, effect * dt * physics.action_force

@@ -69,11 +69,16 @@ def evaluate_scripted(task: str, settings: Any, num_episodes: int) -> dict[str, 
 
 
 def play_scripted(name: str, task: str, settings: Any, num_episodes: int) -> dict[str, float]:
-    """The metrics of one scripted policy there."""
+    """Return the mean of each metric of one scripted policy there."""
+    played = scripted_episodes(name, task, settings, num_episodes)
+    return {metric: float(np.mean(values)) for metric, values in played.items()}
+
+
+def scripted_episodes(name: str, task: str, settings: Any, num_episodes: int) -> dict[str, jax.Array]:
+    """Return the metrics of each episode [K] of one scripted policy there."""
     found = tasks.find(task)
     params = found.numbers(settings, found.make(settings))
-    metrics = scripted_program(name, task, settings, num_episodes)(params, stream_key("report"))
-    return {metric: float(np.mean(values)) for metric, values in metrics.items()}
+    return scripted_program(name, task, settings, num_episodes)(params, stream_key("report"))
 
 
 @cache

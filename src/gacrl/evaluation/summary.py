@@ -1,12 +1,34 @@
 """Numbers over seeds, and on the scale from random to the task's own reference."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from scipy import special  # not scipy.stats: a run would start half a second later
 
 CONFIDENCE = 0.95
+
+
+class Estimate(NamedTuple):
+    """A mean with its 95 % Student interval."""
+
+    mean: float
+    low: float
+    high: float
+    values: np.ndarray
+    """What the interval is of: a number for each seed; of a single seed, for each of its episodes."""
+
+    def __repr__(self) -> str:
+        return f"{self.mean:.4g} [{self.low:.4g}, {self.high:.4g}]"
+
+
+def estimated(values: Float[np.ndarray, "S K"]) -> Estimate:
+    """Estimate the mean of a metric over S seeds, or over the K episodes of a single one."""
+    numbers = np.asarray(values.mean(1) if len(values) > 1 else values[0], float)
+    entry = _one(numbers)
+    low, high = entry["interval"] or (float("nan"), float("nan"))
+    return Estimate(entry["mean"], low, high, numbers)
 
 
 def over_seeds(values: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:

@@ -14,7 +14,7 @@ def row(name: str) -> dict[str, Any]:
     """What must be done in a task, and the scores of its headline: None where nobody has measured one."""
     task = tasks.find(name)
     known: dict[str, Any] = {}
-    if task.anchors is not None:
+    if task.anchors is not None and task.anchors.exists():
         known = json.loads(task.anchors.read_text(encoding="utf-8"))
     scores = known.get("scores", {})
     return {

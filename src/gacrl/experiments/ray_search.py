@@ -20,7 +20,7 @@ from gacrl.experiments.study import Planned, Watch, train_missing
 from gacrl.training import devices
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 
 os.environ.update(  # Ray reads them when it is imported
     RAY_USAGE_STATS_ENABLED="0",

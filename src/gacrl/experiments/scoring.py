@@ -9,6 +9,7 @@ import numpy as np
 
 from gacrl import tasks
 from gacrl.adapters import mpe2
+from gacrl.config.checks import require
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation import episodes as recording
 from gacrl.evaluation import references
@@ -18,7 +19,7 @@ from gacrl.messages.bits import bits_used
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun, open_run
 from gacrl.tasks.task import Task
-from gacrl.types import Memory, Policy
+from gacrl.types import Intervention, Memory, Policy
 
 Warn = Callable[[str], None]
 Change = Callable[[Any], Any]
@@ -54,22 +55,24 @@ def score_run(
     backend: Backend = "jax",
     warn: Warn = lambda sentence: None,
     task: str = tasks.DEFAULT,
+    intervention: Intervention | None = None,
 ) -> dict[str, Any]:
-    """The metrics of a policy, greedy and sampled, with those of the scripted policies on the same starts.
+    """Measure a policy, greedy and sampled, beside the scripted policies on the same starts.
 
-    task: in which a scripted policy plays. Returns {run, backend, episodes, horizon, num_agents, task, final: {greedy,
-    sampled}, references} as in `summary.json`, and messages where agents send symbols. MPE2 draws its own starts:
-    there, the scripted policies play those.
+    task: in which a scripted policy plays. intervention: what happens to the policy's messages. Returns {run, backend,
+    episodes, horizon, num_agents, task, final: {greedy, sampled}, references} as in `summary.json`, and messages where
+    agents send symbols. MPE2 draws its own starts: there, the scripted policies play those. Raises UserError.
     """
     messages = None
     scripted = _scripted_task(run, task, change)
     if scripted is not None:
+        _require_words(run, intervention)
         played = scripted
         beside = _references(played, episodes, backend)
         metrics = beside.get(run) or _play_scripted(run, played, episodes, backend)
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
-        opened = open_run(run, change, warn)
+        opened = open_run(run, change, warn, intervention)
         played = Played(opened.task, opened.config.env)
         beside = _references(played, episodes, backend)
         final = {
@@ -91,6 +94,32 @@ def score_run(
     }
 
 
+def play(
+    run: str,
+    episodes: int,
+    change: Change = unchanged,
+    intervention: Intervention | None = None,
+    sampled: bool = False,
+    task: str | None = None,
+) -> dict[str, np.ndarray]:
+    """Play the fixed episodes of the report and return each metric [S, K] of S seeds; scripted policies have one.
+
+    Raises UserError.
+    """
+    scripted = _scripted_task(run, tasks.DEFAULT if task is None else task, change)
+    if scripted is not None:
+        _require_words(run, intervention)
+        metrics = references.scripted_episodes(run, scripted.task.name, scripted.settings, episodes)
+        return {name: np.asarray(values)[None] for name, values in metrics.items()}
+    opened = open_run(run, change, intervention=intervention)
+    metrics = jax.device_get(opened.trainer.evaluate(opened.learners, sampled, "report", episodes))
+    return {name: values[: opened.config.num_seeds] for name, values in metrics.items()}
+
+
+def _require_words(scripted: str, intervention: Intervention | None) -> None:
+    require(intervention is None, f"{scripted} says nothing: there are no messages to intervene in")
+
+
 def _scripted_task(run: str, task: str, change: Change) -> Played | None:
     """The task that a scripted policy of this name plays; None for a run."""
     found = tasks.find(task)
@@ -105,7 +134,14 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
     network = getattr(config, "network", None)
     if network is None or not kind_of(network).sends_symbols:
         return None
-    heard = _record(opened.policy(0, False), opened.trainer.memory, env, opened.trainer.evaluation_params, _HEARD)
+    heard = _record(
+        opened.policy(0, False),
+        opened.trainer.memory,
+        env,
+        opened.trainer.evaluation_params,
+        _HEARD,
+        opened.trainer.intervention,
+    )
     conversations = env.num_symmetries if config.symmetric_play else 1
     sent = conversations * network.rounds * float(np.log2(network.vocabulary))
     used = bits_used(heard)
@@ -126,20 +162,23 @@ def record_run(
     sampled: bool = False,
     warn: Warn = lambda sentence: None,
     task: str = tasks.DEFAULT,
+    intervention: Intervention | None = None,
 ) -> Recorded:
-    """Episodes of a policy, to look at: the first of those that `score_run` measures."""
+    """Record episodes of a policy, to look at: the first of those that `score_run` measures."""
     played = _scripted_task(run, task, change)
     if played is not None:
+        _require_words(run, intervention)
         actor = references.actor(played.task, run, played.env)
         policy, memory, env = actor.policy, actor.initial_memory, played.env
         params = played.task.numbers(played.settings, env)
     else:
-        opened = open_run(run, change, warn)
+        opened = open_run(run, change, warn, intervention)
         played = Played(opened.task, opened.config.env)
+        intervention = opened.trainer.intervention
         policy, memory, env = opened.policy(0, sampled), opened.trainer.memory, opened.env
         params = opened.trainer.evaluation_params
     look = references.look_of(played.task, played.settings)
-    return Recorded(_record(policy, memory, env, params, episodes, look), played.task)
+    return Recorded(_record(policy, memory, env, params, episodes, intervention, look), played.task)
 
 
 def _record(
@@ -148,9 +187,10 @@ def _record(
     env: Environment,
     params: EnvParams,
     episodes: int,
+    intervention: Intervention | None = None,
     look: recording.Look | None = None,
 ) -> list[recording.Episode]:
-    return recording.record_many(env, policy, memory, params, stream_key("report"), episodes, look=look)
+    return recording.record_many(env, policy, memory, params, stream_key("report"), episodes, intervention, look)
 
 
 def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: Backend) -> dict[str, np.ndarray]:

@@ -13,7 +13,8 @@ from gacrl.training import session
 from gacrl.training.devices import release_memory
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Run, Watcher
+from gacrl.training.session import Ended
+from gacrl.training.watching import Watcher
 
 DIVERGED = "diverged.json"
 """In the folder of a run that ended so: {because}."""
@@ -120,7 +121,7 @@ def claim_folder(
         raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
 
 
-def _train(planned: Planned, watcher: Watcher) -> Run:
+def _train(planned: Planned, watcher: Watcher) -> Ended:
     if (planned.folder / "config.json").is_file():
         return session.resume(planned.folder, watcher=watcher)
     _forget_half_made(planned.folder)

@@ -146,6 +146,29 @@ def parse(text: str) -> Intervention | None:
         raise ConfigError(f"{text!r} is no intervention: write it as `{written}`") from None
 
 
+def of(what: Any) -> Intervention | None:
+    """Return the intervention that an argument stands for: itself, in words, or what arrives in every environment.
+
+    Raises ConfigError for anything else.
+    """
+    if what is None or isinstance(what, Intervention):
+        return what
+    if isinstance(what, str):
+        return parse(what)
+    if isinstance(what, Arrives):
+        return arriving(what)
+    raise ConfigError(f"what arrives must be an intervention such as gacrl.silence(), not {what!r}")
+
+
+def arriving(what: Arrives) -> Intervention:
+    """The same words arrive at every step, and along the same edges: those of one environment, [R, N, V] and [N, N]."""
+
+    def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (first.shape[0], *leaf.shape)), what)
+
+    return Intervention("replace", arrives)
+
+
 def example(text: str, words: Callable[[], tuple[int, ...] | None]) -> Arrives:
     """Return zeros in the shapes of what arrives in one environment where `parse(text)` intervenes.
 
@@ -185,8 +208,11 @@ def _shape(ask: Ask) -> tuple[int, int, int, int]:
 
 def _require_agents(name: str, agents: Sequence[int], words: Words) -> None:
     num_agents = words.shape[2]
-    strangers = [agent for agent in agents if not 0 <= agent < num_agents]
-    require(not strangers, f"{name}: there are the agents 0 to {num_agents - 1}, and no agent {strangers[:1]}")
+    for agent in agents:
+        require(
+            0 <= agent < num_agents,
+            f"there is no agent {agent} to {name}: they are counted from 0 to {num_agents - 1}",
+        )
 
 
 def _require_share(name: str, probability: float) -> None:

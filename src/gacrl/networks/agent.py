@@ -1,4 +1,4 @@
-"""The network of the agents: torso, memory, communication and a head, in this order, each by a setting.
+"""The network of the agents: torso, memory, communication, second look and head, in this order, each by a setting.
 
 Q-learning takes the head for the values of the actions, PPO for logits, and critics have a head of one.
 """
@@ -50,6 +50,7 @@ class Seen(NamedTuple):
     """What an agent network knows before it remembers."""
 
     hidden: Float[Array, "N H"]
+    looked: torsos.Looked
     code: Float[Array, "N Z"] | None
     code_loss: Float[Array, " N"] | float
 
@@ -61,6 +62,7 @@ class AgentNetwork(eqx.Module):
     code: Code | None
     memory: Gru | None
     communication: Communication
+    look: torsos.SecondLook | None
     head: Linear
     radius: float = eqx.field(static=True)
     nearest: int | None = eqx.field(static=True)
@@ -81,6 +83,9 @@ class AgentNetwork(eqx.Module):
         self.code = None if config.latent == "none" else Code(config, code_key)
         self.memory = Gru(config.width, memory_key) if config.recurrent else None
         self.communication = communication.make(env, config, communication_key, gain)
+        self.look = None
+        if config.second_look:
+            self.look = torsos.SecondLook(config, jax.random.fold_in(head_key, 1), gain)
         self.head = Linear(config.width, num_outputs, head_key, head_gain)
         self.radius, self.nearest, self.sight = config.radius, config.nearest_agents, env.sight
 
@@ -111,11 +116,12 @@ class AgentNetwork(eqx.Module):
 
     def see(self, observation: Observation, inbox: Any, key: PRNGKey | None) -> Seen:
         """What comes before the memory: what is seen, its code, and what was heard of the step before."""
-        hidden, code, code_loss = self.torso(observation), None, 0.0
+        looked = self.torso(observation)
+        hidden, code, code_loss = looked.hidden, None, 0.0
         if self.code is not None:
             code, hidden, code_loss = self.code(hidden, None if key is None else jax.random.fold_in(key, 2_000))
         _, near = self._around(observation)
-        return Seen(self.communication.hear(hidden, inbox, near, key), code, code_loss)
+        return Seen(self.communication.hear(hidden, inbox, near, key), looked, code, code_loss)
 
     def say(
         self,
@@ -130,8 +136,10 @@ class AgentNetwork(eqx.Module):
         messages = spoken.messages
         if messages is not None:
             messages = jnp.where(observation.agent_mask[:, None], messages, 0.0)
-        head = self.head(spoken.hidden)
-        output = AgentOutput(head, spoken.hidden, messages, adjacency, spoken.entropy, seen.code_loss, spoken.loss)
+        hidden = spoken.hidden if self.look is None else self.look(spoken.hidden, seen.looked)
+        output = AgentOutput(
+            self.head(hidden), hidden, messages, adjacency, spoken.entropy, seen.code_loss, spoken.loss
+        )
         return output, spoken.inbox
 
     def _around(self, observation: Observation) -> tuple[Bool[Array, "N N"], Neighbourhood]:

@@ -76,7 +76,7 @@ class Critic(eqx.Module):
         return self.head(hidden)[..., 0], memory
 
     def _see(self, observation: Observation) -> Float[Array, "N H"]:
-        hidden = self.torso(observation)
+        hidden = self.torso(observation).hidden
         if self.merge is not None:
             mean = team_mean(hidden, observation) if self.world is None else self.world(global_state(observation))
             everyone = jnp.broadcast_to(mean, hidden.shape)

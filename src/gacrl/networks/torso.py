@@ -4,6 +4,7 @@ Both are computed by each agent from its own observation; what other agents know
 (`networks.communication`).
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
@@ -15,13 +16,23 @@ from jaxtyping import Array, Bool, Float
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.graph import attend, with_length
-from gacrl.networks.layers import Mlp, Score
+from gacrl.networks.layers import Linear, Mlp, Score
 from gacrl.types import Entities, Observation, PRNGKey
 
 NEAR = 0.2
 """Arena units within which an offset is also given magnified: an agent's push moves it this far."""
 SCALES = 5
 """Numbers that an offset is given as."""
+
+
+class Looked(NamedTuple):
+    """What came of looking: a vector for each agent, and one for each landmark that it sees."""
+
+    hidden: Float[Array, "N H"]
+    places: Float[Array, "N L H"] | None = None
+    """None for a torso that does not tell landmarks apart."""
+    there: Bool[Array, "N L"] | None = None
+    """Which of them are in sight."""
 
 
 class MlpTorso(eqx.Module):
@@ -32,8 +43,8 @@ class MlpTorso(eqx.Module):
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         self.layers = Mlp(env.observation_size, (config.width,) * config.depth, key, gain)
 
-    def __call__(self, observation: Observation) -> Float[Array, "N H"]:
-        return self.layers(observation.features)
+    def __call__(self, observation: Observation) -> Looked:
+        return Looked(self.layers(observation.features))
 
 
 class GraphTorso(eqx.Module):
@@ -68,7 +79,7 @@ class GraphTorso(eqx.Module):
         self.view = env.entities
         self.nearest_landmarks, self.nearest_agents = config.nearest_landmarks, config.nearest_agents
 
-    def __call__(self, observation: Observation) -> Float[Array, "N H"]:
+    def __call__(self, observation: Observation) -> Looked:
         seen = self.view(observation)
         own = seen.own
         landmarks = _nearest(seen.landmarks, seen.landmark_mask, seen.landmark_features, self.nearest_landmarks)
@@ -90,7 +101,36 @@ class GraphTorso(eqx.Module):
         others = [_repeat(own, agents.offsets), _scales(agents.offsets), *_features(agents)]
         others = self.agent(jnp.concatenate(others, axis=-1))
         crowd = _pool_max(others, agents.there, axis=1)
-        return self.out(jnp.concatenate([own, chosen, best, crowd], axis=-1))
+        hidden = self.out(jnp.concatenate([own, chosen, best, crowd], axis=-1))
+        return Looked(hidden, places, landmarks.there)
+
+
+class SecondLook(eqx.Module):
+    """One more look at the landmarks, for what was heard: without it, who is told "go to green" has nothing left to
+    choose from, since the torso has pooled the landmarks before anything is heard.
+
+    Attention over the landmarks' vectors, queried by what the agent knows after the messages. A sharpness of 4 nearly
+    undoes the division by √H: agents that hesitate between two landmarks stop between them.
+    """
+
+    query: Linear
+    merge: Linear
+    sharpness: float = eqx.field(static=True)
+
+    def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
+        query_key, merge_key = jax.random.split(key)
+        self.query = Linear(config.width, config.width, query_key, gain)
+        self.merge = Linear(2 * config.width, config.width, merge_key, gain)
+        self.sharpness = config.look_sharpness
+
+    def __call__(self, hidden: Float[Array, "N H"], looked: Looked) -> Float[Array, "N H"]:
+        places, there = looked.places, looked.there
+        assert places is not None and there is not None
+        score = jnp.einsum("nh,nlh->nl", self.query(hidden), places) * (
+            self.sharpness / math.sqrt(places.shape[-1])
+        )
+        chosen = attend(places, jnp.where(there, score, -jnp.inf))
+        return hidden + jax.nn.relu(self.merge(jnp.concatenate([hidden, chosen], axis=-1)))
 
 
 class _Group(NamedTuple):

@@ -17,8 +17,15 @@ from gacrl.tasks.task import Task
 
 DEFAULT = "spread"
 
-_OURS: Mapping[str, tuple[str, str]] = MappingProxyType({"spread": ("gacrl.tasks.spread", "SpreadSettings")})
-"""Per name: the folder, whose `settings` hold a class of this name, and whose `task` holds the record."""
+_OURS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {
+        "spread": ("gacrl.tasks.spread", "SpreadSettings", "TASK"),
+        "speaker_listener": ("gacrl.tasks.navigation", "SpeakerListenerSettings", "SPEAKER_LISTENER"),
+        "reference": ("gacrl.tasks.navigation", "ReferenceSettings", "REFERENCE"),
+        "colours": ("gacrl.tasks.navigation", "ColoursSettings", "COLOURS"),
+    }
+)
+"""Per name: the folder, whose `settings` hold a class of this name, and whose `task` holds this record."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,8 @@ def brought(name: str) -> Own | None:
 def find(name: str) -> Task:
     """The task of that name. Raises ConfigError with the nearest name where it is not at hand."""
     if name in _OURS:
-        return import_module(f"{_OURS[name][0]}.task").TASK
+        folder, _, record = _OURS[name]
+        return getattr(import_module(f"{folder}.task"), record)
     _require_at_hand(name)
     return _OWN[name].task
 
@@ -65,7 +73,7 @@ def find(name: str) -> Task:
 def default_settings(name: str) -> Any:
     """The settings of that task as they stand where nothing is said. Raises ConfigError."""
     if name in _OURS:
-        folder, kind = _OURS[name]
+        folder, kind, _ = _OURS[name]
         return getattr(import_module(f"{folder}.settings"), kind)()
     _require_at_hand(name)
     return _OWN[name].settings

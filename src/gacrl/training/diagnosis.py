@@ -8,7 +8,7 @@ import jax
 from gacrl.training import build, session
 from gacrl.training.divergence import not_finite
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ import jax
 
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
+from gacrl.training.build import Plan
 from gacrl.training.devices import wait_for_all
 from gacrl.training.peers import Peers, Place, meet
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Plan, Watcher
+from gacrl.training.watching import Watcher
 from gacrl.versions import version
 
 ALONE = Place(0, 1, "", 0)

@@ -18,13 +18,14 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
-from gacrl.training.build import Plan, evaluated_settings, make_trainer, member_shapes, plan, stacked_shapes
+from gacrl.training.build import evaluated_settings, make_trainer, member_shapes, plan, stacked_shapes
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
-from gacrl.training.loop import Clock, Progress, train
+from gacrl.training.loop import Clock, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
 from gacrl.versions import versions
@@ -34,7 +35,7 @@ SHOWN_EPISODES = 4
 
 
 @dataclass(frozen=True)
-class Run:
+class Ended:
     """A run that has come to an end, planned or not."""
 
     folder: Path
@@ -43,18 +44,6 @@ class Run:
     summary: dict[str, Any] | None
     """The content of `summary.json`; None where the run was stopped before its end. Empty in processes that do not
     write."""
-
-
-@dataclass(frozen=True)
-class Watcher:
-    """What a run tells whoever looks on, and asks: all of it optional."""
-
-    planned: Callable[[RunFolder, RunConfig, Plan], None] = lambda folder, config, plan: None
-    compiling: Callable[[], None] = lambda: None
-    progress: Callable[[Progress], None] = lambda progress: None
-    finishing: Callable[[], None] = lambda: None
-    warn: Callable[[str], None] = lambda sentence: None
-    stop: Callable[[], bool] = lambda: False
 
 
 class Parent(NamedTuple):
@@ -70,7 +59,7 @@ class Parent(NamedTuple):
 
 def start(
     config: RunConfig, out: Path | None = None, watcher: Watcher | None = None, parent: Parent | None = None
-) -> Run:
+) -> Ended:
     """Train from the beginning, into a new run folder; with the parameters of a parent, where one is given.
 
     Raises UserError for a parent whose network does not fit.
@@ -106,7 +95,7 @@ def begin_with(trainer: Trainer, config: RunConfig, parent: Parent) -> TrainStat
     return state._replace(learner=state.learner._replace(**kept))
 
 
-def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Run:
+def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Ended:
     """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
     watcher = watcher or Watcher()
     folder = RunFolder.open(path)
@@ -175,7 +164,7 @@ def _run(
     watcher: Watcher,
     fingerprint: str,
     begun: TrainState | None = None,
-) -> Run:
+) -> Ended:
     """begun: the state to begin with, stacked, where it is not a fresh one."""
     again = tasks.flag(config.task)
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
@@ -200,9 +189,10 @@ def _run(
                     keep(progress)
                 watcher.progress(progress)
                 if anyone(watcher.stop()) and not progress.done:
-                    return Run(folder.path, config, env_steps, None)
+                    return Ended(folder.path, config, env_steps, None)
         watcher.finishing()
         summary = _finish(folder, config, trainer, state, env_steps, clock)
+        watcher.finished(summary)
     except Diverged as error:
         raise Diverged(
             f"{error}, or see the first bad update with `gacrl resume {folder.path}{again} --diagnose`, which begins "
@@ -217,7 +207,7 @@ def _run(
             f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
             f"then `gacrl resume {folder.path}{again}` goes on from the last checkpoint"
         ) from error
-    return Run(folder.path, config, env_steps, summary)
+    return Ended(folder.path, config, env_steps, summary)
 
 
 def _clock(found: checkpoint.Checkpoint) -> Clock:

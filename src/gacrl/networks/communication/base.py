@@ -9,6 +9,7 @@ from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -35,6 +36,13 @@ class Neighbourhood(NamedTuple):
         if self.speakers is not None:
             return words[self.speakers]
         return jnp.broadcast_to(words[None], (words.shape[0], *words.shape))
+
+    def who(self) -> Float[Array, "N K N"]:
+        """Return who each agent's speakers are, as one-hots."""
+        num_agents, count = self.adjacency.shape
+        if self.speakers is not None:
+            return jax.nn.one_hot(self.speakers, num_agents)
+        return jnp.broadcast_to(jnp.eye(num_agents), (num_agents, count, num_agents))
 
 
 class Spoken(NamedTuple):

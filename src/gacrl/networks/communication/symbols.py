@@ -4,6 +4,7 @@ import math
 from abc import abstractmethod
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,6 +31,9 @@ class Symbols(Communication):
     edge: tuple[Mlp, ...]
     query: tuple[Linear, ...]
     merge: tuple[Linear, ...]
+    noise: float = eqx.field(static=True)
+    straight_through: bool = eqx.field(static=True)
+    speaker_identity: bool = eqx.field(static=True)
 
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, narrow, symbols = config.width, config.width // 2, config.vocabulary
@@ -37,7 +41,10 @@ class Symbols(Communication):
         first = width if config.latent == "none" else config.latent_size
         sizes = (first, *[width] * (config.rounds - 1))
         self.encode = tuple(Linear(i, symbols, k, gain) for i, k in zip(sizes, encode, strict=True))
-        self.edge = tuple(Mlp(symbols + sighted_size(env), (narrow,), k, gain) for k in edge)
+        self.noise, self.straight_through = config.symbol_noise, config.symbols == "straight_through"
+        self.speaker_identity = config.speaker_identity
+        known = symbols + sighted_size(env) + env.num_agents * config.speaker_identity
+        self.edge = tuple(Mlp(known, (narrow,), k, gain) for k in edge)
         self.query = tuple(Linear(width, narrow, k, gain) for k in query)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
 
@@ -49,7 +56,9 @@ class Symbols(Communication):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        seen, said, entropy = sighted(near.sight), [], jnp.zeros(hidden.shape[0])
+        known, said, entropy = [sighted(near.sight)], [], jnp.zeros(hidden.shape[0])
+        if self.speaker_identity:
+            known.append(near.who())
         for number, (encode, edge, query, merge) in enumerate(
             zip(self.encode, self.edge, self.query, self.merge, strict=True)
         ):
@@ -59,11 +68,16 @@ class Symbols(Communication):
             draw = None if key is None else jax.random.fold_in(key, number)
             said.append(self.symbol(logits, draw, temperature))
             words = received(said[-1], near, number, len(self.encode))
-            edges_heard = edge(jnp.concatenate([words, seen], axis=-1))
+            edges_heard = edge(jnp.concatenate([words, *known], axis=-1))
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
             heard = attend(edges_heard, jnp.where(near.adjacency, score, -jnp.inf))
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
         return Spoken(hidden, jnp.stack(said), (), entropy)
+
+    def drawn(self, key: PRNGKey, logits: Float[Array, "N V"]) -> Float[Array, "N V"]:
+        """Draw the Gumbel noise of a round."""
+        noise = jax.random.gumbel(key, logits.shape)
+        return noise if self.noise == 1.0 else self.noise * noise
 
     @abstractmethod
     def symbol(
@@ -73,7 +87,11 @@ class Symbols(Communication):
 
 
 class DiscreteSymbols(Symbols):
-    """One-hot symbols: drawn while learning, with the gradient of the soft sample, the most likely ones when played."""
+    """Symbols that are one-hot when played, the most likely ones.
+
+    While learning they are one-hot as well, with the gradient of the soft sample, or soft. (A one-hot sample is drawn
+    the same way at every temperature: only soft ones grow sharper as it falls, and are heard before they are sharp.)
+    """
 
     sends_symbols: ClassVar[bool] = True
 
@@ -82,7 +100,7 @@ class DiscreteSymbols(Symbols):
     ) -> Float[Array, "N V"]:
         if key is None:
             return most_likely_symbol(logits)
-        return gumbel_softmax(logits, jax.random.gumbel(key, logits.shape), temperature, straight_through=True)
+        return gumbel_softmax(logits, self.drawn(key, logits), temperature, self.straight_through)
 
 
 class SoftSymbols(Symbols):
@@ -93,4 +111,4 @@ class SoftSymbols(Symbols):
     ) -> Float[Array, "N V"]:
         if key is None:
             return jax.nn.softmax(logits / temperature)
-        return gumbel_softmax(logits, jax.random.gumbel(key, logits.shape), temperature)
+        return gumbel_softmax(logits, self.drawn(key, logits), temperature)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.envs.particles import DIRECTIONS, Physics, pairwise_offsets
+from gacrl.envs.particles import DIRECTIONS, Physics, coast, pairwise_offsets
 from gacrl.tasks.spread.assignment import assign
 from gacrl.tasks.spread.environment import (
     CAPTURE_RADIUS,
@@ -65,7 +65,7 @@ def oracle(env: Spread) -> Actor:
         landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
 
         free = ~(agents & (landmark >= 0) & wanted[landmark])
-        coasting, _ = _coast(state, params.physics)
+        coasting, _ = coast(state.positions, state.velocities, params.physics)
         target = _intercept(coasting, posts[landmark], motion[landmark], params)
         return Decision(_steer(env, state, agents, target, free)), landmark
 
@@ -129,7 +129,7 @@ def _steer(
 ) -> Array:
     """The actions that bring agents to their targets, out of each other's way; `free` ones stay where they like."""
     physics = env.default_params().physics
-    coasting, reach = _coast(state, physics)
+    coasting, reach = coast(state.positions, state.velocities, physics)
     target = _make_room(jnp.where(free[:, None], coasting, target), free, agents, physics)
     pushes = _pushes((target - coasting) / reach, env.continuous_actions)
     outcomes = coasting[:, None] + reach * pushes
@@ -160,7 +160,7 @@ def _posts(state: SpreadState, landmark_mask: Bool[Array, " L"]) -> tuple[Float[
 def _intercept(
     start: Float[Array, "#M 2"], posts: Float[Array, "M 2"], motion: Float[Array, "M 2"], params: SpreadParams
 ) -> Float[Array, "M 2"]:
-    """Where agents at top speed meet their moving posts, no sooner than `_coast` looks ahead."""
+    """Where agents at top speed meet their moving posts, no sooner than `coast` looks ahead."""
     meeting = posts
     for _ in range(2):  # time from place, place from time, and once more
         time = _length(meeting - start) / params.physics.top_speed + 3 * params.physics.time_step
@@ -178,16 +178,6 @@ def _make_room(
     shift = -(offsets * (overlap / 2 / jnp.maximum(distance, 1e-6))[..., None]).sum(1)
     length = jnp.maximum(_length(shift), 1e-6)
     return targets + shift * jnp.minimum(1.0, jnp.where(free, jnp.inf, SHIFT) / length)[:, None]
-
-
-def _coast(state: SpreadState, physics: Physics) -> tuple[Float[Array, "N 2"], Float[Array, ""] | float]:
-    """Positions three steps ahead without any push, and how far one of full force, now, moves them.
-
-    A push changes the velocity after the first step; in the third, damping has taken its share.
-    """
-    kept, dt = 1 - physics.damping, physics.time_step
-    effect = dt * (1 + kept)
-    return state.positions + (dt + effect * kept) * state.velocities, effect * dt * physics.action_force
 
 
 def _pushes(exact: Float[Array, "N 2"], continuous: bool) -> Float[Array, "N C 2"]:

@@ -1,0 +1,40 @@
+"""The records of `speaker_listener`, `reference` and `colours`."""
+
+from pathlib import Path
+
+from gacrl.tasks.navigation.environment import make
+from gacrl.tasks.navigation.scene import scene
+from gacrl.tasks.navigation.scripted import centroid, guess, told
+from gacrl.tasks.navigation.settings import METRICS, ColoursSettings, ReferenceSettings, SpeakerListenerSettings
+from gacrl.tasks.task import Task, Words
+
+ANCHORS = Path(__file__).with_name("anchors")
+
+REFERENCE = Task(
+    name="reference",
+    settings=ReferenceSettings,
+    make=make,
+    metrics=METRICS,
+    progress="reached_0.2",
+    references={"told": told, "centroid": centroid},
+    anchors=ANCHORS / "reference.json",
+    scene=scene,
+    comparable=("max_cycles",),
+    words=Words(mark="landmark", lit="reached"),
+    summary="each of two agents knows the other's goal alone (MPE2 simple_reference_v3)",
+)
+
+SPEAKER_LISTENER = REFERENCE._replace(
+    name="speaker_listener",
+    settings=SpeakerListenerSettings,
+    anchors=ANCHORS / "speaker_listener.json",
+    summary="one agent knows the goal, the other one moves (MPE2 simple_speaker_listener_v4)",
+)
+COLOURS = REFERENCE._replace(
+    name="colours",
+    settings=ColoursSettings,
+    anchors=ANCHORS / "colours.json",
+    references={"told": told, "centroid": centroid, "guess": guess},
+    comparable=("num_agents", "num_landmarks", "graph", "named", "max_cycles"),
+    summary="agents in a ring: each must stand on a landmark that only the one before it knows",
+)
