@@ -75,7 +75,7 @@ def work(preset: str, process: int, address: str, count: int) -> None:
     from gacrl.config import presets
     from gacrl.training import build, distributed
     from gacrl.training.devices import prepare_jax
-    from gacrl.training.session import Watcher
+    from gacrl.training.watching import Watcher
 
     prepare_jax()
     place = distributed.find_place(address, count, process) if count > 1 else distributed.ALONE

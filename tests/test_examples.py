@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -17,8 +16,8 @@ import gacrl
 from gacrl.cli.main import main
 from gacrl.config.kinds import COMMUNICATION
 from gacrl.evaluation.evaluate import evaluate, stream_key
+from gacrl.messages import interventions
 from gacrl.play import open_run
-from gacrl.types import Channel
 
 ROOT = Path(__file__).parent.parent
 SILENT, TOLD = 1.2, 5.6
@@ -47,10 +46,10 @@ def silenced(folder: Path) -> float:
     """What the policy of a run brings when nobody hears anything."""
     opened = open_run(folder)
     env, params, memory = opened.env, opened.trainer.evaluation_params, opened.trainer.memory
-    channel = Channel(edge_keep=jnp.zeros((env.num_agents, env.num_agents)))
 
     def play() -> Any:
-        return evaluate(env, opened.policy(0, False), memory, params, stream_key("report"), 320, channel)
+        policy, key = opened.policy(0, False), stream_key("report")
+        return evaluate(env, policy, memory, params, key, 320, interventions.silence())
 
     return float(np.mean(jax.jit(play)()["return_agent_mean"]))
 

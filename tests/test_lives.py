@@ -14,7 +14,7 @@ from gacrl.config.algorithms import IppoConfig, IqlConfig, NetworkConfig
 from gacrl.config.run import TrainingConfig
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
-from gacrl.types import Channel, Decision
+from gacrl.types import Decision
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -70,7 +70,7 @@ def test_values_end_with_a_life(kind: Any, recurrent: bool):
     world, seen = env.reset(jax.random.key(0))
     memory = trainer.memory
     for _ in range(4):
-        decision, memory = policy(memory, seen, jax.random.key(0), Channel())
+        decision, memory = policy(memory, seen, jax.random.key(0))
         values.append((world["age"], decision.extras["value"]))
         world, after = env.step(world, decision.action, jax.random.key(0))
         seen = after.observation
@@ -86,7 +86,7 @@ def test_who_takes_a_slot_remembers_nothing():
     """The memory counts an agent's steps: it begins anew with a life, for the whole team with an episode."""
     env = Slots(max_cycles=5)
 
-    def policy(memory: Any, observation: Any, key: Any, channel: Any) -> Any:
+    def policy(memory: Any, observation: Any, key: Any) -> Any:
         own, team = memory
         return Decision(jnp.zeros(2, jnp.int32), extras=memory), (own + 1, team + 1)
 

@@ -20,7 +20,6 @@ from gacrl.config.run import RunConfig
 from gacrl.training import build, checkpoint
 from gacrl.training.devices import one_seed, without_padding
 from gacrl.training.recorder import RunFolder
-from gacrl.types import Channel
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -67,21 +66,21 @@ def test_it_acts_as_the_trained_policy_does(
     actions = []
     for features in observations:
         seen = trainer.env.from_features(jnp.asarray(features, jnp.float32))
-        decision, _ = act((), seen, jax.random.key(0), Channel())
+        decision, _ = act((), seen, jax.random.key(0))
         actions.append(policy(features))
         np.testing.assert_array_equal(actions[-1], decision.action)
-        np.testing.assert_array_equal(policy.message, decision.message)
+        np.testing.assert_array_equal(policy.messages, decision.messages)
     assert len(np.unique(actions)) > 1, "actions depend on what is seen"
     assert isinstance(actions[0], np.ndarray)
     assert actions[0].shape == (N,)
-    assert policy.message.shape == (N, V)
-    np.testing.assert_array_equal(np.sort(policy.message)[:, -2:], [[0, 1]] * N)
+    assert policy.messages is not None and policy.messages.shape == (2, N, V), "what is summed, and a symbol"
+    np.testing.assert_array_equal(np.sort(policy.messages[-1])[:, -2:], [[0, 1]] * N)
 
 
 def test_a_sampling_policy_repeats_its_draws_after_a_reset(policy: gacrl.LoadedPolicy, observations: np.ndarray):
     def episode(seed: int) -> tuple[np.ndarray, np.ndarray]:
         policy.reset(seed=seed)
-        steps = [(policy(seen, greedy=False), policy.message) for seen in observations]
+        steps = [(policy(seen, greedy=False), policy.messages[-1]) for seen in observations]
         return np.stack([action for action, _ in steps]), np.stack([message for _, message in steps])
 
     (first, said), (again, said_again), (other, _) = episode(1), episode(1), episode(2)
@@ -151,7 +150,7 @@ def test_scripted_policies_can_be_held_too():
     random = gacrl.load_policy("random")
     drawn = np.stack([random(observations, greedy=False) for _ in range(40)])
     assert set(np.unique(drawn)) == set(range(5))
-    assert random.message is None
+    assert random.messages is None
     with pytest.raises(gacrl.UserError, match="oracle needs the exact state"):
         gacrl.load_policy("oracle")
 
@@ -183,7 +182,7 @@ def test_a_policy_is_saved_without_what_only_learning_needs(run: Path, observati
     mine, theirs = gacrl.load_policy(saved), gacrl.load_policy(f"{run}@1")
     for seen in observations[:8]:
         np.testing.assert_array_equal(mine(seen), theirs(seen))
-        np.testing.assert_array_equal(mine.message, theirs.message)
+        np.testing.assert_array_equal(mine.messages, theirs.messages)
     with pytest.raises(gacrl.UserError, match="exists: choose another folder"):
         play.save_policy(run, saved)
 

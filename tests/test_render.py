@@ -52,7 +52,7 @@ def world(
         np.repeat(rows[None], steps + 1, axis=0) if rows.ndim == 2 else rows for rows in (positions, landmarks)
     )
     agents = positions.shape[1]
-    messages = None if symbols is None else np.eye(64)[np.repeat([symbols], steps, axis=0)]
+    messages = None if symbols is None else np.eye(64)[np.repeat([[symbols]], steps, axis=0)]
     seen = discs(positions, 0.15, agent_mask)
     near = np.linalg.norm(positions[:, :, None] - landmarks[:, None], axis=-1) < 0.1
     values = {
@@ -106,7 +106,7 @@ def walk(seed: int, agents: int = 3, steps: int = 25) -> Episode:
         positions,
         rng.uniform(-1, 1, (agents, 2)),
         steps,
-        messages=rng.uniform(size=(steps, agents, 8)),
+        messages=rng.dirichlet(np.ones(8), (steps, 1, agents)),
         adjacency=(distance < 1.5) & ~np.eye(agents, dtype=bool),
     )
 
@@ -160,11 +160,38 @@ def test_each_agent_shows_its_symbol_in_a_colour_of_its_own():
         assert abs(column - 240 - 220 * (x + 0.15)) < 12
         assert abs(row - (240 - 220 * (y + 0.15))) < 12
     # After the last step the last words stay; the ninth symbol has the first one's colour, not its letter.
-    quiet = world([[0, 0]], [[0.5, 0.5]], messages=np.zeros((3, 1, 8)))
+    quiet = world([[0, 0]], [[0.5, 0.5]], messages=np.zeros((3, 1, 1, 8)))
     first, ninth = (scene(render.frame(world([[0, 0]], [[0.5, 0.5]], symbols=[s]), 3)) for s in (0, 8))
     assert len(where(first, render.SYMBOL_COLOURS[0])) > 100
     assert len(where(scene(render.frame(quiet, 3)), render.SYMBOL_COLOURS[0])) == 0
     assert 5 < (first != ninth).any(-1).sum() < 200
+
+
+def test_each_round_has_a_bubble_of_its_own_from_left_to_right():
+    def said(*rounds: Any) -> np.ndarray:
+        """One agent's words of each round, at each of three steps."""
+        words = np.stack([np.eye(8)[word] if isinstance(word, int) else np.asarray(word) for word in rounds])
+        return np.tile(words[None, :, None], (3, 1, 1, 1))
+
+    def picture(messages: np.ndarray | None) -> np.ndarray:
+        return np.asarray(render.frame(world([[0, 0]], [[0.9, 0.9]], messages=messages), 1)).astype(int)
+
+    def columns(values: np.ndarray, symbol: int) -> np.ndarray:
+        return where(values[38:518], render.SYMBOL_COLOURS[symbol], 4)[:, 1]
+
+    both, first = picture(said(1, 2)), picture(said(1))
+    np.testing.assert_allclose(columns(both, 1).mean(), columns(first, 1).mean(), atol=3)
+    assert len(columns(first, 2)) == 0 and len(columns(both, 2)) > 100
+    assert columns(both, 2).mean() - columns(both, 1).mean() > 8
+    three = picture(said(1, 2, 3))
+    steps = np.diff([columns(three, symbol).mean() for symbol in (1, 2, 3)])
+    np.testing.assert_allclose(steps[0], steps[1], atol=4)
+    # Words that are no symbol, and no word, have no bubble; nor a line in the legend where there is no other.
+    numbers = np.linspace(-1, 2, 8)
+    np.testing.assert_array_equal(picture(said(numbers, 1)), first)
+    np.testing.assert_array_equal(picture(said(np.zeros(8), 1)), first)
+    np.testing.assert_array_equal(picture(said(numbers, numbers)), picture(None))
+    assert (picture(None)[-40:] != first[-40:]).any()
 
 
 @pytest.mark.parametrize("vision", VISION)

@@ -16,7 +16,6 @@ from gacrl.config.run import TrainingConfig
 from gacrl.envs.probes import Probe
 from gacrl.errors import ConfigError
 from gacrl.tasks.spread.environment import Spread
-from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -44,7 +43,7 @@ def test_when_the_world_turns_the_actions_turn(preset: str, continuous: bool):
         policy = algorithm.policy(drawn_learner(algorithm), False)
 
         def act(observation):
-            return policy(memory, observation, jax.random.key(0), Channel())[0].action
+            return policy(memory, observation, jax.random.key(0))[0].action
 
         def both(observation, symmetry):
             turned = act(env.turn(observation, symmetry))
@@ -62,7 +61,7 @@ def test_it_is_the_mean_over_eight_conversations():
     algorithm, (_, seen) = made("gacrl", env, symmetric=True), jax.jit(env.reset)(jax.random.key(3))
     learner = drawn_learner(algorithm)
     play = jax.jit(algorithm.policy(learner, False))
-    decision, _ = play(algorithm.initial_memory(3), seen, jax.random.key(0), Channel())
+    decision, _ = play(algorithm.initial_memory(3), seen, jax.random.key(0))
     ask = jax.jit(lambda symmetry: learner.target.agent(env.turn(seen, symmetry))[0])
     total = np.zeros((3, 5))
     for symmetry in range(8):
@@ -70,7 +69,7 @@ def test_it_is_the_mean_over_eight_conversations():
         for action in range(5):
             total[:, action] += numbers[:, env.turn_action(jnp.asarray(action), jnp.asarray(symmetry))]
     np.testing.assert_array_equal(decision.action, total.argmax(1))
-    np.testing.assert_array_equal(decision.message, ask(0).message)
+    np.testing.assert_array_equal(decision.messages, ask(0).messages)
 
 
 def test_networks_that_do_not_go_with_their_learner_are_refused():

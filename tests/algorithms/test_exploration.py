@@ -17,7 +17,7 @@ from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.probes import Probe
 from gacrl.errors import ConfigError
-from gacrl.types import Channel, Decision, Transition
+from gacrl.types import Decision, Transition
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -287,9 +287,7 @@ def test_ppo_acts_by_the_mixture_and_says_how_likely_that_was(rule: str, updates
     memory = algorithm.initial_memory(2)
     _, seen = FEW.reset(jax.random.key(0))
     act = jax.jit(
-        lambda keys, explore: jax.vmap(
-            lambda key: algorithm.policy(learner, explore)(memory, seen, key, Channel())[0]
-        )(keys),
+        lambda keys, explore: jax.vmap(lambda key: algorithm.policy(learner, explore)(memory, seen, key)[0])(keys),
         static_argnums=1,
     )
     keys = jax.random.split(jax.random.key(1), 8_000)

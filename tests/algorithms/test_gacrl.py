@@ -21,7 +21,6 @@ from gacrl.networks.messages import most_likely_symbol
 from gacrl.tasks.spread.environment import Spread
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
-from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -110,8 +109,9 @@ def test_it_learns_from_its_replay_and_acts_as_the_task_wants(continuous: bool):
 
     learner = jax.tree.map(lambda leaf: leaf[0], state.learner)
     _, seen = env.reset(jax.random.key(0))
-    decision, _ = algorithm.policy(learner, True)(trainer.memory, seen, jax.random.key(1), Channel())
-    np.testing.assert_array_equal(decision.message.sum(-1), 1.0)
+    decision, _ = algorithm.policy(learner, True)(trainer.memory, seen, jax.random.key(1))
+    assert decision.messages.shape == (1, 2, 4)
+    np.testing.assert_array_equal(decision.messages.sum(-1), 1.0)
     if continuous:
         assert decision.action.shape == (2, 5)
         assert set(np.unique(decision.action)) <= {0.0, 1.0, *STRENGTHS}

@@ -4,6 +4,7 @@ The oracle is the paper's text in NumPy: loops over rows and agents, float64, no
 """
 
 import dataclasses
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -15,13 +16,13 @@ from gacrl.algorithms import gacrl_paper, replay
 from gacrl.algorithms.gacrl_paper_exploration import Coverage
 from gacrl.config import presets
 from gacrl.config.algorithms import GacrlPaperConfig
-from gacrl.config.run import CurriculumConfig
+from gacrl.config.run import CurriculumConfig, TrainingConfig
 from gacrl.errors import ConfigError
 from gacrl.networks.layers import num_parameters
 from gacrl.tasks.spread.environment import Spread
 from gacrl.tasks.spread.task import TASK
 from gacrl.training import curriculum
-from gacrl.types import Channel, Rollout, Transition
+from gacrl.types import Arrives, Rollout, Transition
 
 N, B = 3, 16
 CONFIG = dataclasses.replace(GacrlPaperConfig(), batch_size=B, replay_capacity=3)
@@ -104,7 +105,11 @@ def paper_forward(w, o, A, tau=None, noise=None, gumbel=None, shift=None):
         hidden = relu(w["Wpolicy"] @ relu(w["W5"] @ x + w["b5"]) + w["bpolicy"])
         pi.append(softmax(w["W6"] @ hidden + w["b6"]))  # (11)
     return SimpleNamespace(
-        pi=np.array(pi), message=np.array(messages), mean=np.array(mean), log_variance=np.array(log_variance)
+        pi=np.array(pi),
+        sent=np.array(m),
+        message=np.array(messages),
+        mean=np.array(mean),
+        log_variance=np.array(log_variance),
     )
 
 
@@ -177,6 +182,7 @@ def to_library(rows):
         jnp.asarray(rows.A),
         jnp.asarray(rows.a, jnp.int32),
         jnp.asarray(rows.r, jnp.float32),
+        Arrives(),
     )
     noise = gacrl_paper.Noise(
         jnp.asarray(rows.noise.transpose(2, 1, 0), jnp.float32),
@@ -188,7 +194,7 @@ def to_library(rows):
 GRADIENT = jax.jit(jax.value_and_grad(gacrl_paper.loss, has_aux=True), static_argnums=5)
 ACT = jax.jit(
     lambda learner, observation, keys: jax.vmap(
-        lambda key: ALGORITHM.policy(learner, True)((), observation, key, Channel())[0]
+        lambda key: ALGORITHM.policy(learner, True)((), observation, key)[0]
     )(keys)
 )
 KEYS = jax.random.split(jax.random.key(7), 4096)
@@ -385,7 +391,7 @@ def test_acting_is_the_papers_forward_pass():
     for k in (0, 1):
         noise = jax.tree.map(lambda leaf: np.asarray(leaf[k], np.float64), decision.extras["noise"])  # noqa: B023
         out = paper_forward(w, o, REACH, 1.99, noise.latent.T, noise.gumbel.T)
-        np.testing.assert_allclose(decision.message[k], out.message, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(decision.messages[k], [out.sent, out.message], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(decision.extras["value"][0], paper_value(w, o), rtol=1e-5)
     np.testing.assert_array_equal(decision.adjacency[0], REACH)
 
@@ -420,13 +426,13 @@ def test_actions_are_as_frequent_as_the_mixture_says():
 
 def test_greedy_policy_draws_nothing():
     learner, observation = fixed_learner(), observe()
-    greedy = jax.jit(jax.vmap(lambda key: ALGORITHM.policy(learner, False)((), observation, key, Channel())[0]))
+    greedy = jax.jit(jax.vmap(lambda key: ALGORITHM.policy(learner, False)((), observation, key)[0]))
     decision = greedy(KEYS[:2])
     jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf[0], leaf[1]), decision)
     assert set(decision.extras) == {"value"}
 
     out = paper_forward(paper_weights(learner.network), np.asarray(observation.features, np.float64), REACH)
-    np.testing.assert_array_equal(decision.message[0], out.message)
+    np.testing.assert_array_equal(decision.messages[0, 1], out.message)
     np.testing.assert_array_equal(decision.action[0], out.pi.argmax(1))
 
 
@@ -469,7 +475,7 @@ class Updates:
     """(rows, temperature, noise) as each update hands them to the loss."""
 
 
-_, UNPACK = replay.packing(lambda: gacrl_paper.no_experience(N, 18))
+_, UNPACK = replay.packing(partial(gacrl_paper.no_experience, ALGORITHM.init.args[0]))
 COVERAGE = (1 / 3, 2 / 3, 1 / 3)
 STORED = np.array([100.0, 101.0, 102.0])
 
@@ -483,6 +489,7 @@ def updates():
         jnp.asarray(rng.uniform(size=(3, N, N)) < 0.5),
         jnp.asarray(rng.integers(0, 5, (3, N)), jnp.int32),
         jnp.asarray(STORED, jnp.float32),
+        Arrives(),
     )
     learner = learner._replace(replay=replay.Replay(jax.vmap(replay.pack)(stored), jnp.int32(6)))
 
@@ -595,7 +602,7 @@ def test_other_tasks_are_explored_by_their_own_progress(monkeypatch, progress, m
         "loss",
         lambda network, *rest: (network.critic.w8.bias.sum(), {"loss": rest[1].reward[-1]}),
     )
-    update = jax.jit(gacrl_paper.make(CONFIG, ENV, None, progress).update)
+    update = jax.jit(gacrl_paper.make(CONFIG, ENV, TrainingConfig(), progress).update)
     step = Transition(
         observation=observe(),
         decision=jax.tree.map(lambda leaf: leaf[0], ACT(fixed_learner(), observe(), KEYS)),

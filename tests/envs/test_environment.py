@@ -10,8 +10,8 @@ import pytest
 
 from gacrl import rollout
 from gacrl.algorithms.actions import choices
-from gacrl.envs.environment import Environment, TimeStep, observe, side_by_side
-from gacrl.types import Decision, Observation
+from gacrl.envs.environment import Environment, TimeStep, observe, side_by_side, with_self
+from gacrl.types import Decision, Entities, Observation
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -19,13 +19,13 @@ FEATURES = jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
 
 
 def same(found: Observation, **expected: Any) -> None:
-    """What is not named must be None; values and types are those that are expected."""
+    """What is not named holds nothing; values and types are those that are expected."""
     for name, value in found._asdict().items():
         if name in expected:
             np.testing.assert_array_equal(value, expected[name], err_msg=name)
             assert value.dtype == np.asarray(expected[name]).dtype, name
         else:
-            assert value is None, name
+            assert not jax.tree.leaves(value), name
 
 
 # Observations.
@@ -187,6 +187,53 @@ def test_many_copies_are_the_step_of_each():
     np.testing.assert_array_equal(step.truncated, [False, True, False, True])
 
 
+# What agents see of each other.
+
+
+def test_an_entry_for_oneself_goes_between_those_for_the_others():
+    pairs = jnp.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [7.0, 8.0]], [[9.0, 10.0], [11.0, 12.0]]])
+    expected = [
+        [[0, 0], [1, 2], [3, 4]],
+        [[5, 6], [0, 0], [7, 8]],
+        [[9, 10], [11, 12], [0, 0]],
+    ]
+    np.testing.assert_array_equal(with_self(pairs), expected)
+    np.testing.assert_array_equal(with_self(jnp.array([[[1.0]], [[2.0]]])), [[[0], [1]], [[2], [0]]])
+    np.testing.assert_array_equal(with_self(jnp.zeros((1, 0, 3))), np.zeros((1, 1, 3)))
+    assert with_self(jnp.zeros((4, 3, 0))).shape == (4, 4, 0)
+
+
+@dataclass(frozen=True)
+class Watched(Counting):
+    """Offsets 1 to 12 to the others, and features that are the offsets' first numbers times 100."""
+
+    told: bool = False
+    others: int = 2
+
+    def entities(self, observation: Observation) -> Entities:
+        alone = super().entities(observation)
+        agents = jnp.arange(1.0, 1 + 6 * self.others).reshape(3, self.others, 2)
+        there = jnp.ones((3, self.others), bool).at[1, :1].set(False).at[2].set(False)
+        features = 100 * agents[..., :1] if self.told else None
+        return alone._replace(agents=agents, agent_mask=there, agent_features=features)
+
+
+def test_by_default_agents_see_of_each_other_what_the_entities_say():
+    """Agent 1 does not see agent 0, agent 2 nobody: of whom they do not see they are told nothing."""
+    _, seen = ENV.reset(KEY)
+    offsets = [[[0, 0], [1, 2], [3, 4]], [[0, 0], [0, 0], [7, 8]], [[0, 0], [0, 0], [0, 0]]]
+    np.testing.assert_array_equal(Watched().sight(seen), offsets)
+    features = np.array([[0, 100, 300], [0, 0, 700], [0, 0, 0]])[..., None]
+    np.testing.assert_array_equal(Watched(told=True).sight(seen), np.concatenate([offsets, features], axis=-1))
+
+
+def test_agents_that_are_alone_or_tell_of_a_few_only_see_nobody():
+    """Entities that are not all others in order do not say whose voice is whose."""
+    _, seen = ENV.reset(KEY)
+    for env in (ENV, Watched(others=0), Watched(others=1), Watched(others=3)):
+        assert env.sight(seen).shape == (3, 3, 0)
+
+
 # What a rollout makes of it.
 
 
@@ -203,7 +250,7 @@ def test_the_mean_reward_is_that_of_those_who_are_there_unless_the_task_says_it(
     assert float(rollout.measured(nobody)["reward_raw"]) == 0.0
 
 
-def count_on(memory: Any, observation: Observation, key: Any, channel: Any) -> Any:
+def count_on(memory: Any, observation: Observation, key: Any) -> Any:
     """Everyone counts; what is remembered is how often each did, and how often anyone was asked."""
     mine, ours = memory
     return Decision(jnp.ones(3, jnp.int32), extras=memory), (mine + 1, ours + 1)

@@ -23,7 +23,7 @@ from gacrl.tasks.spread.environment import Spread, unpack_state
 from gacrl.tasks.spread.scene import scene
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.tasks.spread.task import TASK
-from gacrl.types import Channel, Decision
+from gacrl.types import Arrives, Decision, Intervention
 
 KEY = jax.random.key(7)
 
@@ -44,17 +44,18 @@ def covered(episode: Episode) -> np.ndarray:
     return np.asarray(marks.lit) & np.asarray(marks.there)
 
 
-def tell_the_state(memory, observation, key, channel):
-    """Moves about; the messages show the state that they were sent in, the channel, and the memory."""
+def tell_the_state(memory, observation, key):
+    """Moves about; the messages show the state that they were sent in, what arrives, and the memory."""
     action = jnp.abs(1000 * observation.positions[:, 0]).astype(jnp.int32) % 5
-    noise = jnp.zeros(()) if channel.noise is None else channel.noise
-    facts = jnp.concatenate([observation.state, noise[None], memory[None]])
-    message = jnp.broadcast_to(facts, (len(action), len(facts)))
+    values = observation.arrives.values
+    heard = jnp.zeros(()) if values is None else values.mean()
+    facts = jnp.concatenate([observation.state, heard[None], memory[None]])
+    messages = jnp.broadcast_to(facts, (1, len(action), len(facts)))
     adjacency = proximity_adjacency(observation.positions, observation.agent_mask, 0.9)
-    return Decision(action, message, adjacency), memory + 1
+    return Decision(action, messages, adjacency), memory + 1
 
 
-def approach(memory, observation, key, channel):
+def approach(memory, observation, key):
     """Every agent pushes towards the first landmark."""
     push = 2 * observation.features[:, 4:6] - observation.features[:, :2]
     action = jnp.stack([0 * push[:, 0], -push[:, 0], push[:, 0], -push[:, 1], push[:, 1]], axis=1)
@@ -67,20 +68,20 @@ def test_a_recording_is_what_the_environment_does():
     params = env.default_params()._replace(
         landmark_speed=jnp.float32(0.3), arena_scale=jnp.float32(0.7), landmark_mask=mask
     )
-    channel = Channel(noise=jnp.float32(0.25))
-    recorded = record_many(env, tell_the_state, jnp.zeros(()), params, KEY, 2, channel, looking_at(env))
+    quarters = Intervention("quarters", lambda state, ask, *_: Arrives(0 * ask(Arrives()) + 0.25))
+    recorded = record_many(env, tell_the_state, jnp.zeros(()), params, KEY, 2, quarters, looking_at(env))
 
     step = jax.jit(env.step)
     for episode in recorded:
         assert episode.num_steps == env.max_cycles
         agents, marks, lines, ground = seen_in(episode)
-        packed = jnp.asarray(episode.messages[0, 0, :-2])
+        packed = jnp.asarray(episode.messages[0, 0, 0, :-2])
         state = unpack_state(packed, 2)
         for t in range(env.max_cycles):
             np.testing.assert_allclose(agents.positions[t], state.positions, atol=1e-5)
             np.testing.assert_allclose(marks.positions[t, :2], state.landmarks[:2], atol=1e-5)
-            np.testing.assert_allclose(episode.messages[t, 1, :-2], packed, atol=1e-5)
-            np.testing.assert_allclose(episode.messages[t, 1, -2:], [0.25, t])
+            np.testing.assert_allclose(episode.messages[t, 0, 1, :-2], packed, atol=1e-5)
+            np.testing.assert_allclose(episode.messages[t, 0, 1, -2:], [0.25, t])
             near = np.linalg.norm(np.subtract(*state.positions)) < 0.9
             np.testing.assert_array_equal(episode.adjacency[t], near & ~np.eye(2, dtype=bool))
             state, after = step(state, episode.actions[t], KEY, params)
@@ -226,7 +227,7 @@ def small_episode(**changes) -> Episode:
         "reward": rng.normal(size=(steps, agents)),
         "reward_raw": rng.normal(size=steps),
         "agent_mask": rng.uniform(size=(steps, agents)) < 0.5,
-        "messages": rng.uniform(size=(steps, agents, 8)),
+        "messages": rng.uniform(size=(steps, 2, agents, 8)),
         "adjacency": rng.uniform(size=(steps, agents, agents)) < 0.5,
     }
     return Episode(**(values | changes))
@@ -246,6 +247,16 @@ def test_a_saved_episode_comes_back(tmp_path, changes):
         np.testing.assert_array_equal(one, other)
         assert one.dtype == other.dtype
     assert [file.name for file in tmp_path.iterdir()] == ["episode"]
+
+
+def test_symbols_are_what_is_said_of_one_thing_alone():
+    """Two rounds of two agents: one-hot, a distribution; nothing at all, and numbers that are no distribution."""
+    said = np.array([[[0, 0, 1, 0], [0.2, 0.5, 0.2, 0.1]], [[0, 0, 0, 0], [0.5, 0.5, -0.5, 0.5]]])
+    messages = np.stack([said, said[::-1], said, said])
+    symbols = [[2, 1], [-1, -1]]
+    np.testing.assert_array_equal(
+        small_episode(messages=messages).symbols, [symbols, symbols[::-1], symbols, symbols]
+    )
 
 
 class Bomb:

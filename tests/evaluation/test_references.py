@@ -12,7 +12,7 @@ from gacrl.envs.environment import Environment, observe
 from gacrl.errors import ConfigError
 from gacrl.evaluation import references
 from gacrl.tasks.task import Task
-from gacrl.types import Actor, Channel
+from gacrl.types import Actor
 
 KEYS = jax.random.split(jax.random.key(0), 8_000)
 AVAILABLE = np.array([[True, True, True, True], [False, True, False, True], [False, False, False, True]])
@@ -38,7 +38,7 @@ class Corner(Environment):
 def actions(actor: Actor, env: Environment) -> np.ndarray:
     """One for each key [K, N, …]."""
     _, seen = env.reset(KEYS[0])
-    return np.asarray(jax.vmap(lambda key: actor.policy((), seen, key, Channel())[0].action)(KEYS))
+    return np.asarray(jax.vmap(lambda key: actor.policy((), seen, key)[0].action)(KEYS))
 
 
 def test_every_available_action_is_equally_likely_and_no_other_is_taken():

@@ -20,7 +20,7 @@ from gacrl.tasks.task import HEADLINE
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -66,7 +66,7 @@ def test_networks_without_a_part_are_about_as_large(planned: dict[str, Planned])
     assert shrunk < 0.95 * whole, "what was evened out"
 
 
-def finish(config: RunConfig, out: Path, score: float) -> session.Run:
+def finish(config: RunConfig, out: Path, score: float) -> session.Ended:
     """A finished run of made-up numbers: seeds a little around the score."""
     folder = RunFolder.create(out, config)
     folder.append_metrics(
@@ -84,7 +84,7 @@ def finish(config: RunConfig, out: Path, score: float) -> session.Run:
     values = {"values": [score + 0.001 * k for k in range(config.num_seeds)]}
     summary = {"final": {"greedy": dict.fromkeys(METRICS, values)}}
     folder.write_summary(summary)
-    return session.Run(out, config, STEPS[-1], summary)
+    return session.Ended(out, config, STEPS[-1], summary)
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
     """Runs end at once: worse without messages, better without symmetry, and diverging without the bonus."""
     started: list[RunConfig] = []
 
-    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Run:
+    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Ended:
         started.append(config)
         if config.env.reward == "mpe2":
             RunFolder.create(out, config)

@@ -19,7 +19,8 @@ from gacrl.experiments.search import Searched, proposals
 from gacrl.experiments.study import Watch
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Run, Watcher
+from gacrl.training.session import Ended
+from gacrl.training.watching import Watcher
 
 FILE = """
 preset = "ippo"
@@ -51,7 +52,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Instead of training a run is written whose metric is 100 × its learning rate; the rates that were trained."""
     rates: list[float] = []
 
-    def start(config: RunConfig, out: Path, watcher: Watcher) -> Run:
+    def start(config: RunConfig, out: Path, watcher: Watcher) -> Ended:
         assert not isinstance(config.algorithm, GacrlPaperConfig)
         rate = config.algorithm.learning_rate
         rates.append(rate)
@@ -64,7 +65,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         if rate > 5e-3:
             raise Diverged("seed 3 diverged: loss is nan by environment step 400; try a smaller one")
         folder.write_summary({})
-        return Run(out, config, 400, {})
+        return Ended(out, config, 400, {})
 
     monkeypatch.setattr(study.session, "start", start)
     return rates

@@ -17,7 +17,7 @@ from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -73,13 +73,13 @@ def test_only_what_is_missing_is_trained(tmp_path: Path, monkeypatch: pytest.Mon
     runs = [tiny(tmp_path, seed) for seed in range(3)]
     started: list[Path] = []
 
-    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Run:
+    def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Ended:
         started.append(out)
         folder = RunFolder.create(out, config)
         if watcher.stop():
-            return session.Run(out, config, 10, None)
+            return session.Ended(out, config, 10, None)
         folder.write_summary({})
-        return session.Run(out, config, 30, {})
+        return session.Ended(out, config, 30, {})
 
     monkeypatch.setattr(session, "start", start)
     assert not train_missing([tiny(tmp_path, 9), *runs], watched([], stop_after=0)), "stopped: nothing else begins"

@@ -13,7 +13,7 @@ def episode(symbols: list[list[int]], vocabulary: int = 4) -> Episode:
     """Two agents that send these; −1: nothing."""
     spoken = np.array(symbols)
     steps = len(spoken)
-    messages = np.where(spoken[..., None] == np.arange(vocabulary), 1.0, 0.0)
+    messages = np.where(spoken[:, None, :, None] == np.arange(vocabulary), 1.0, 0.0)
     return Episode(
         actions=np.zeros((steps, 2), int),
         messages=messages,
@@ -48,8 +48,17 @@ def test_episodes_are_counted_together_and_padding_not():
     assert bits_used([joining]) == pytest.approx(0.9182958)  # ⅓ log2(3) + ⅔ log2(3/2)
 
 
+def test_the_last_round_is_counted_whatever_was_said_before():
+    """Symbols of an earlier round, and numbers that are none, as the paper's agents send along the graph."""
+    last = episode([[0, 1], [2, 3]])
+    assert last.messages is not None
+    for earlier in (0 * last.messages + [1.0, 0, 0, 0], np.full(last.messages.shape, -1.5)):
+        said = np.concatenate([earlier, last.messages], axis=1)
+        assert bits_used([replace(last, messages=said)]) == pytest.approx(2.0)
+
+
 def test_what_is_no_symbol_has_no_bits():
     said = episode([[0, 1]])
     assert bits_used([replace(said, messages=None)]) is None
-    assert bits_used([replace(said, messages=np.full((1, 2, 4), 0.25))]) is None
+    assert bits_used([replace(said, messages=np.full((1, 1, 2, 4), 0.25))]) is None
     assert bits_used([episode([[-1, -1]])]) is None

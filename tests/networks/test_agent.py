@@ -14,7 +14,6 @@ from gacrl.envs.probes import Probe
 from gacrl.networks.agent import AgentMemory, AgentNetwork, matched, unroll
 from gacrl.networks.layers import num_parameters
 from gacrl.tasks.spread.environment import Spread
-from gacrl.types import Channel
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -56,8 +55,9 @@ def test_messages_of_padded_agents_are_nothing():
     _, seen = env.reset(jax.random.key(0), env.default_params()._replace(agent_mask=mask))
     memory = network.initial_memory(3)
     assert isinstance(memory, AgentMemory) and memory.carry == ()
-    output, _ = eqx.filter_jit(lambda *inputs: network(*inputs))(seen, memory, jax.random.key(2), Channel())
-    assert (np.asarray(output.message)[[0, 2]] > 0).all() and (output.message[1] == 0).all()
+    output, _ = eqx.filter_jit(lambda *inputs: network(*inputs))(seen, memory, jax.random.key(2))
+    assert output.messages is not None and output.messages.shape == (1, 3, 3)
+    assert (np.asarray(output.messages)[:, [0, 2]] > 0).all() and (output.messages[:, 1] == 0).all()
     assert not output.adjacency[1].any() and not output.adjacency[:, 1].any()
 
 

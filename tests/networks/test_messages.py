@@ -1,18 +1,20 @@
-"""Equations (3), (4), (7), (9) by hand, and what a channel does to messages."""
+"""Equations (3), (4), (7), (9) by hand, the graph that is left where edges are cut, and what arrives of words."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gacrl.envs.environment import observe
+from gacrl.errors import ConfigError
+from gacrl.networks.arrives import arriving
 from gacrl.networks.encoder import kl_divergence, sample_latent
-from gacrl.networks.graph import neighbour_sum, proximity_adjacency
-from gacrl.networks.messages import gumbel_softmax, mailbox, most_likely_symbol, transmit
-from gacrl.types import Channel
+from gacrl.networks.graph import heard_adjacency, nearest_speakers, neighbour_sum, proximity_adjacency
+from gacrl.networks.messages import gumbel_softmax, most_likely_symbol
+from gacrl.types import Arrives
 
 V, N = 4, 3
 MESSAGES = jax.nn.softmax(jnp.asarray(np.random.default_rng(0).normal(size=(V, N)), jnp.float32), axis=0)
-SYMBOLS = jnp.eye(V)[:, jnp.array([2, 0, 3])]
 
 
 def test_reparameterisation_by_hand():
@@ -44,9 +46,7 @@ def test_neighbour_sum_by_hand():
     """(7): row i of A picks the j that i sums over; a plain sum, the same for one neighbour or two."""
     m = jnp.array([[1.0, 20.0, 300.0], [0.5, 0.25, 0.125]])
     adjacency = jnp.array([[False, True, True], [False, False, True], [False, False, False]])
-    np.testing.assert_array_equal(neighbour_sum(m, adjacency, Channel()), [[320, 300, 0], [0.375, 0.125, 0]])
-    cut = Channel(edge_keep=jnp.ones((3, 3)).at[0, 2].set(0.0))
-    np.testing.assert_array_equal(neighbour_sum(m, adjacency, cut), [[20, 300, 0], [0.25, 0.125, 0]])
+    np.testing.assert_array_equal(neighbour_sum(m, adjacency), [[320, 300, 0], [0.375, 0.125, 0]])
 
 
 def test_gumbel_softmax_by_hand():
@@ -77,68 +77,48 @@ def test_most_likely_symbol():
     )
 
 
-# The channel. Entry [:, i, j] of what transmit returns is j's message as it reaches i.
+# Edges, and what arrives along them.
 
 
-def test_default_channel_changes_no_bit():
-    received, memory = transmit(MESSAGES, Channel())
-    assert memory == ()
-    for i in range(N):
-        np.testing.assert_array_equal(received[:, i, :], MESSAGES)
+def test_a_cut_edge_is_no_edge_one_way():
+    """0 hears nothing of 2; 2 still hears 0. In a graph of the task, of distance, and of everyone."""
+    kept = jnp.ones((3, 3), bool).at[0, 2].set(False)
+    everyone = ~np.eye(3, dtype=bool)
+    prescribed = jnp.array([[False, True, True], [False, False, True], [True, False, False]])
+    places = jnp.array([[0.0, 0.0], [5.0, 0.0], [1.0, 0.0]])
+    features = jnp.zeros((3, 1))
+    for seen, graph in (
+        (observe(features, num_actions=1), everyone),
+        (observe(features, num_actions=1, adjacency=prescribed), np.asarray(prescribed)),
+        (observe(features, num_actions=1, positions=places), [[0, 0, 1], [0, 0, 0], [1, 0, 0]]),
+    ):
+        np.testing.assert_array_equal(heard_adjacency(seen, 1.5), graph)
+        cut = np.array(graph, bool)
+        cut[0, 2] = False
+        found = heard_adjacency(seen._replace(arrives=Arrives(kept=kept)), 1.5)
+        np.testing.assert_array_equal(found, cut)
+        m = jnp.array([[1.0, 20.0, 300.0]])
+        np.testing.assert_array_equal(neighbour_sum(m, found), m @ cut.T)
 
 
-def test_edge_keep_silences_one_way():
-    """0 hears nothing of 2; 2 still hears 0."""
-    keep = jnp.ones((N, N)).at[0, 2].set(0.0)
-    received, _ = transmit(MESSAGES, Channel(edge_keep=keep))
-    np.testing.assert_array_equal(received[:, 0, 2], np.zeros(V))
-    for i, j in ((2, 0), (0, 1), (1, 2)):
-        np.testing.assert_array_equal(received[:, i, j], MESSAGES[:, j])
+def test_the_nearest_speakers_are_the_nearest_along_the_edges():
+    """On a line at 0, 1, 3 and 7; agent 0 does not hear agent 1."""
+    places = jnp.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [7.0, 0.0]])
+    graph = (~jnp.eye(4, dtype=bool)).at[0, 1].set(False)
+    np.testing.assert_array_equal(nearest_speakers(places, graph, 2), [[2, 3], [0, 2], [1, 0], [2, 1]])
+    np.testing.assert_array_equal(nearest_speakers(None, graph, 2), [[2, 3], [0, 2], [0, 1], [0, 1]])
 
 
-def test_symbol_map_translates_each_sender_apart():
-    """Sender 0's symbol v arrives as v + 1 (mod 4), 1's unchanged, 2's as any of the four."""
-    shift = np.roll(np.eye(V), 1, axis=1)
-    maps = jnp.asarray(np.stack([shift, np.eye(V), np.full((V, V), 1 / V)]), jnp.float32)
-    received, _ = transmit(SYMBOLS, Channel(symbol_map=maps))
-    for i in range(N):
-        np.testing.assert_array_equal(received[:, i, :].T, [[0, 0, 0, 1], [1, 0, 0, 0], [1 / V] * V])
-    received, _ = transmit(MESSAGES, Channel(symbol_map=maps))
-    np.testing.assert_array_equal(received[:, 1, 0], np.roll(MESSAGES[:, 0], 1))
+def test_what_arrives_by_default_is_what_was_said():
+    for arrives in (Arrives(), Arrives(kept=jnp.zeros((N, N), bool))):  # a cut edge is the graph's
+        np.testing.assert_array_equal(arriving(MESSAGES.T, arrives), MESSAGES.T)
 
 
-def test_delay_is_exactly_that_many_steps():
-    """Step t says t + 1; delayed by d, t + 1 - d arrives, and silence before the start."""
-    for delay, arrived in ((0, [1, 2, 3, 4]), (1, [0, 1, 2, 3]), (2, [0, 0, 1, 2])):
-        memory, heard = mailbox(N, V, 2), []
-        for t in range(4):
-            said = jnp.full((V, N), t + 1.0)
-            received, memory = transmit(said, Channel(delay=jnp.int32(delay)), memory=memory)
-            assert np.ptp(received) == 0
-            heard.append(float(received[0, 0, 0]))
-        assert heard == arrived
-
-
-def test_channels_that_lack_something_say_so():
-    with pytest.raises(ValueError, match="mailbox"):
-        transmit(MESSAGES, Channel(delay=jnp.int32(1)))
-    with pytest.raises(ValueError, match="random key"):
-        transmit(MESSAGES, Channel(noise=jnp.float32(0.5)))
-
-
-def test_noise_replaces_messages_by_uniform_symbols():
-    """At 1 every message is a random symbol; at 0.25 a quarter of them are, the rest arrives as sent."""
-    keys = jax.random.split(jax.random.key(0), 4_000)
-    send = jax.jit(lambda noise: jax.vmap(lambda key: transmit(MESSAGES, Channel(noise=noise), key)[0])(keys))
-    received = np.asarray(send(jnp.float32(1.0)))
-    assert (received.sum(1) == 1).all() and (received.max(1) == 1).all()
-    # One broken message for all who hear it.
-    np.testing.assert_array_equal(received[:, :, 0], received[:, :, 1])
-    for j in range(N):
-        counts = received[:, :, 0, j].sum(0)
-        assert ((counts - 1_000) ** 2 / 1_000).sum() < 21.1  # the 0.9999 quantile at 3 degrees of freedom
-
-    intact = (np.asarray(send(jnp.float32(0.25)))[:, :, 0, :] == np.asarray(MESSAGES)).all(1)
-    assert abs(intact.mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / intact.size)
-    intact = (np.asarray(send(jnp.float32(0.0)))[:, :, 0, :] == np.asarray(MESSAGES)).all()
-    assert intact
+def test_what_arrives_is_of_the_round_and_of_whom_it_is_marked():
+    values = jnp.arange(2.0 * N * V).reshape(2, N, V)
+    np.testing.assert_array_equal(arriving(MESSAGES.T, Arrives(values), 1, 2), values[1])
+    marks = jnp.array([[True, False, False], [False, True, True]])
+    expected = np.stack([MESSAGES.T[0], values[1, 1], values[1, 2]])
+    np.testing.assert_array_equal(arriving(MESSAGES.T, Arrives(values, marks), 1, 2), expected)
+    with pytest.raises(ConfigError, match=r"what arrives must be .* = \[1, 3, 4\], not \[2, 3, 4\]"):
+        arriving(MESSAGES.T, Arrives(values))

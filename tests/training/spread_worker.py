@@ -17,8 +17,8 @@ from gacrl.config.presets import preset
 from gacrl.config.run import RunConfig, TrainingConfig
 from gacrl.training import build, distributed
 from gacrl.training.devices import gathered, leads, without_padding
-from gacrl.training.session import Watcher
 from gacrl.training.trainer import Trainer
+from gacrl.training.watching import Watcher
 
 UPDATES = 10
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from test_soak import config
 
 from gacrl.experiments.study import Planned, Watch, train_missing
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 
 folder, end = Path(sys.argv[1]), time.monotonic() + float(sys.argv[2])
 for turn in itertools.count(1):

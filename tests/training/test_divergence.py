@@ -32,7 +32,7 @@ def breaking(at: int, loss: float) -> Algorithm:
     """Agents that stand still, and whose weights are broken by one update; the loss is finite up to then."""
 
     def policy(learner: Weights, explore: bool) -> Any:
-        return lambda memory, observation, key, channel: (Decision(jnp.zeros(3, jnp.int32)), memory)
+        return lambda memory, observation, key: (Decision(jnp.zeros(3, jnp.int32)), memory)
 
     def init(key: Any, hyper: Any) -> Weights:
         return Weights({"layer": jnp.ones((2, 3))}, jnp.zeros((), jnp.int32))

@@ -14,7 +14,8 @@ from gacrl.config import presets
 from gacrl.config.presets import PRESETS
 from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.training import build, session
-from gacrl.training.session import Run, Watcher
+from gacrl.training.session import Ended
+from gacrl.training.watching import Watcher
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -50,12 +51,12 @@ def tiny(name: str, **changes: Any) -> RunConfig:
     )
 
 
-def rows(run: Run) -> list[dict[str, Any]]:
+def rows(run: Ended) -> list[dict[str, Any]]:
     lines = (run.folder / "metrics.jsonl").read_text().splitlines()
     return [{name: value for name, value in json.loads(line).items() if name not in TIMES} for line in lines]
 
 
-def parameters(run: Run) -> dict[str, bytes]:
+def parameters(run: Ended) -> dict[str, bytes]:
     """The newest checkpoint, and the best policy."""
     folders = [max(run.folder.glob("checkpoints/step-*")), *run.folder.glob("checkpoints/best-*")]
     return {folder.name: (folder / "state.safetensors").read_bytes() for folder in folders}

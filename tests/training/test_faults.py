@@ -29,7 +29,7 @@ from gacrl.errors import UserError
 from gacrl.experiments.paper import tables as paper_tables
 from gacrl.training import build, checkpoint, session
 from gacrl.training.recorder import RunFolder
-from gacrl.training.session import Watcher
+from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]

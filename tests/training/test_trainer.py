@@ -167,7 +167,7 @@ def remembering(env: Environment) -> Algorithm:
     """A linear policy that follows a made-up gradient, and remembers what it saw."""
 
     def policy(learner: Remembered, explore: bool) -> Policy:
-        def act(memory: Any, observation: Any, key: Any, channel: Any) -> tuple[Decision, Any]:
+        def act(memory: Any, observation: Any, key: Any) -> tuple[Decision, Any]:
             return Decision(jax.random.categorical(key, observation.features @ learner.weights)), memory
 
         return act

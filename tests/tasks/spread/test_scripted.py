@@ -19,10 +19,9 @@ from gacrl.tasks.spread import scripted
 from gacrl.tasks.spread.environment import Spread, SpreadState, pack_state, unpack_state
 from gacrl.tasks.spread.settings import METRICS, SpreadSettings
 from gacrl.tasks.spread.task import TASK
-from gacrl.types import Actor, Channel, Decision
+from gacrl.types import Actor, Decision
 
 KEY = jax.random.key(7)
-QUIET = Channel()
 SCRIPTED = ("random", "noop", "oracle")
 """Stand beside every number."""
 
@@ -55,7 +54,7 @@ def play_on(env: Spread, positions, landmarks, num_steps: int, name: str = "orac
         def step(loop, _):
             state, memory = loop
             observation = env.observe(state, env.default_params())
-            decision, memory = actor.policy(memory, observation, KEY, QUIET)
+            decision, memory = actor.policy(memory, observation, KEY)
             return (env.step(state, decision.action, KEY)[0], memory), None
 
         start = at_rest(positions, landmarks), actor.initial_memory
@@ -91,11 +90,11 @@ def player():
 
     @jax.jit
     def play(which, landmark_speed, seen_share):
-        def policy(memories, observation, key, channel):
+        def policy(memories, observation, key):
             state = unpack_state(observation.state, env.num_agents)
             state = state._replace(landmark_velocities=seen_share * state.landmark_velocities)
             observation = observation._replace(state=pack_state(state))
-            decided = [one.policy(m, observation, key, channel) for one, m in zip(policies, memories, strict=True)]
+            decided = [one.policy(m, observation, key) for one, m in zip(policies, memories, strict=True)]
             action = jnp.stack([decision.action for decision, _ in decided])[which]
             return Decision(action), tuple(memory for _, memory in decided)
 
@@ -142,8 +141,8 @@ def test_floors_with_continuous_actions():
     env = Spread(continuous_actions=True)
     random, noop = references.random(env).policy, references.noop(env).policy
     observation = jax.jit(functools.partial(observe, env))(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
-    np.testing.assert_array_equal(noop((), observation, KEY, QUIET)[0].action, np.zeros((3, 5)))
-    pushes = random((), observation, KEY, QUIET)[0].action
+    np.testing.assert_array_equal(noop((), observation, KEY)[0].action, np.zeros((3, 5)))
+    pushes = random((), observation, KEY)[0].action
     assert pushes.shape == (3, 5)
     assert 0 <= pushes.min() < 0.3 < 0.7 < pushes.max() <= 1
 
@@ -183,7 +182,7 @@ def test_the_assignment_is_optimal_and_kept(num_agents, num_landmarks):
     @jax.jit
     @jax.vmap
     def remember(memory, positions, landmarks):
-        return oracle.policy(memory, observe(env, positions, landmarks), KEY, QUIET)[1]
+        return oracle.policy(memory, observe(env, positions, landmarks), KEY)[1]
 
     positions, landmarks = starts(100, num_agents, num_landmarks)
     memory = remember(jnp.tile(oracle.initial_memory, (100, 1)), positions, landmarks)
@@ -201,7 +200,7 @@ def test_padding_changes_nothing():
 
         def act(positions, landmarks):
             seen = env.observe(at_rest(positions, landmarks), params)
-            return oracle.policy(oracle.initial_memory, seen, KEY, QUIET)
+            return oracle.policy(oracle.initial_memory, seen, KEY)
 
         return jax.jit(jax.vmap(act))(positions, landmarks)
 
@@ -218,7 +217,7 @@ def test_large_teams_pay_for_the_assignment_once():
     oracle = scripted.oracle(env)
     places = starts(2, 200, 200, arena_scale=8.0)
     observations = jax.jit(jax.vmap(functools.partial(observe, env)))(*places)
-    act = jax.jit(jax.vmap(lambda memory, observation: oracle.policy(memory, observation, KEY, QUIET)[1]))
+    act = jax.jit(jax.vmap(lambda memory, observation: oracle.policy(memory, observation, KEY)[1]))
 
     def fastest(memory):
         """Seconds of the best of seven calls, and the memory after."""

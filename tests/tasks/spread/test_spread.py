@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from jax import lax
 
 from gacrl.envs.particles import Physics
+from gacrl.envs.symmetry import turn_vectors
 from gacrl.tasks.spread.environment import Spread, SpreadParams, SpreadState, pack_state, unpack_state
 
 KEY = jax.random.key(0)
@@ -431,3 +432,54 @@ def test_the_packed_state_is_all_of_it(num_agents, num_landmarks):
     assert packed.shape == (4 * num_agents + 4 * num_landmarks,)
     np.testing.assert_array_equal(packed, pack_state(state))
     jax.tree.map(np.testing.assert_array_equal, unpack_state(packed, num_agents), state)
+
+
+# What agents see of each other.
+
+
+@pytest.mark.parametrize("count", [None, 1, 3, 4, 9])
+def test_agents_see_of_each_other_what_their_features_show(count):
+    """Of five, all in order or the nearest ones; so do observations that are made of bare features."""
+    env = Spread(5, 2, num_agent_neighbors=count)
+    look = jax.jit(lambda state: env.observe(state, env.default_params()))
+    see = jax.jit(env.sight)
+    for seed in range(8):
+        state = crowd(seed, 5, 2)
+        seen = look(state)
+        sight = np.asarray(see(seen))
+        np.testing.assert_array_equal(see(env.from_features(seen.features)), sight)
+        shown = np.asarray(seen.features)[:, 4 + 2 * 2 :][:, : 2 * env.seen_agents].reshape(5, -1, 2)
+        places = np.asarray(state.positions)
+        for i in range(5):
+            others = [j for j in range(5) if j != i]
+            in_sight = [j for j in others if sight[i, j].any()]
+            assert len(in_sight) == min(4, env.seen_agents)
+            nearest = sorted(others, key=lambda j: np.linalg.norm(places[j] - places[i]))
+            assert in_sight == others if count is None else set(in_sight) == set(nearest[: len(in_sight)])
+            order = in_sight if count is None else nearest[: len(in_sight)]
+            np.testing.assert_array_equal(shown[i, : len(order)], sight[i, order])
+            np.testing.assert_allclose(sight[i, order], places[order] - places[i], atol=1e-6)
+            assert not sight[i, i].any() and not shown[i, len(order) :].any()
+
+
+@pytest.mark.parametrize("count", [None, 2])
+def test_who_is_not_there_is_not_seen(count):
+    """Neither in the features nor beside a voice; and it sees nobody."""
+    env = Spread(4, 2, num_agent_neighbors=count)
+    there = np.array([True, False, True, True])
+    seen = env.observe(crowd(3, 4, 2), env.default_params()._replace(agent_mask=jnp.asarray(there)))
+    sight, shown = np.asarray(env.sight(seen)), np.asarray(seen.features)[:, 8 : 8 + 2 * env.seen_agents]
+    assert not shown[1].any() and (np.abs(shown[there]).reshape(3, -1, 2).max(-1) > 0).sum() == 3 * 2
+    assert not sight[:, 1].any()
+    assert not sight[1].any()
+    assert (np.abs(sight).max(-1) > 0).sum() == 3 * 2
+
+
+def test_sight_turns_with_the_world():
+    env = Spread(4, 2, num_agent_neighbors=2)
+    seen = env.observe(crowd(5, 4, 2), env.default_params())
+    for symmetry in range(env.num_symmetries):
+        turned = env.turn(seen, jnp.asarray(symmetry))
+        np.testing.assert_allclose(
+            env.sight(turned), turn_vectors(env.sight(seen), jnp.asarray(symmetry)), atol=1e-6
+        )

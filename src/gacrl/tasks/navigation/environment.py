@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.config.checks import require
 from gacrl.envs.environment import Environment, TimeStep, observe
 from gacrl.envs.particles import DIRECTIONS, Physics, action_forces, integrate
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
@@ -194,30 +193,38 @@ class Navigation(Environment):
         return (moves | (action % MOVES == 0)) & (speaks | (action // MOVES == 0))
 
     def stack(self, rows: Sequence[Any]) -> Float[np.ndarray, "N O"]:
-        """Lay out MPE2's observations as `observe` does; identities and what an agent does not see are filled in."""
-        rules, num_agents = self.rules, self.num_agents
-        if len(rows) != num_agents or np.size(rows[0]) == self.observation_size:
+        """Lay out MPE2's observations as `observe` does; identities, and 0 for what an agent does not see, are added.
+
+        Raises ConfigError where they do not fit.
+        """
+        places, layout = self._seen_in_mpe2(), self.observation_size - self.num_agents * self.identity
+        if [np.size(row) for row in rows] != [len(seen) for seen in places]:
             return super().stack(rows)
-        heard = rules.words * (num_agents - 1)
-        layout = np.arange(self.vectors + rules.landmarks + heard)
-        goal = layout[self.vectors : self.vectors + rules.landmarks]
-        features = np.zeros((num_agents, self.observation_size), np.float32)
+        features = np.zeros((self.num_agents, self.observation_size), np.float32)
         for agent, row in enumerate(rows):
-            seen = [layout[: self.vectors]] if rules.moves[agent] else []
-            seen += [goal] if rules.knows[agent] >= 0 else []
-            seen += [layout[goal[-1] + 1 :]] if rules.hears[agent] else []
-            places = np.concatenate(seen)
-            numbers = np.asarray(row, np.float32).reshape(-1)
-            require(
-                numbers.size == places.size,
-                f"agent {agent} sees {places.size} numbers, not {numbers.size}",
-            )
-            features[agent, places] = numbers
+            features[agent, places[agent]] = row
         if not self.utters:
-            features[:, goal[-1] + 1 : layout.size] = 0.0
+            features[:, self.vectors + self.rules.landmarks : layout] = 0.0
         if self.identity:
-            features[:, layout.size :] = np.eye(num_agents)
+            features[:, layout:] = np.eye(self.num_agents)
         return features
+
+    def _seen_in_mpe2(self) -> list[Int[np.ndarray, " _"]]:
+        """Where in the features of each agent the numbers stand that MPE2 shows it."""
+        rules, heard = self.rules, self.vectors + self.rules.landmarks
+        vectors, goal = np.arange(self.vectors), np.arange(self.vectors, heard)
+        words = np.arange(heard, heard + rules.words * (self.num_agents - 1))
+        nothing = np.arange(0)
+        return [
+            np.concatenate(
+                [
+                    vectors if rules.moves[agent] else nothing,
+                    goal if rules.knows[agent] >= 0 else nothing,
+                    words if rules.hears[agent] else nothing,
+                ]
+            )
+            for agent in range(self.num_agents)
+        ]
 
     def unstack(self, actions: Array | np.ndarray) -> list[int]:
         """Return MPE2's actions: of who does not move what it says, of who does not speak how it moves."""

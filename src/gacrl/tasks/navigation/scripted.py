@@ -38,7 +38,7 @@ def _walker(env: Navigation, target_of: Callable[..., Float[Array, "N 2"]]) -> A
         state = unpack_state(observation.state, env.num_agents, env.rules.landmarks)
         positions, velocities, landmarks, goals = state
         coasting, reach = coast(positions, velocities, physics)
-        places = coasting[:, None] + reach * jnp.asarray(DIRECTIONS)  # [N 5 2]
+        places = coasting[:, None] + reach * jnp.asarray(DIRECTIONS)[None]  # [N 5 2]
         distance = jnp.square(places - target_of(landmarks, goals)[:, None]).sum(-1)
         return Decision(jnp.where(moves, distance.argmin(1), 0)), memory
 
