@@ -24,6 +24,7 @@ from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison, Pair, compare
 from gacrl.experiments.compare.data import to_dict, to_marl_eval
 from gacrl.experiments.compare.marl_eval import from_marl_eval
+from gacrl.experiments.compare.report import write_page
 
 REFERENCES = {
     who: {"return_agent_mean": value, "coverage_final_0.1": coverage, "collisions": 1.0}
@@ -333,7 +334,7 @@ def test_a_group_that_lost_seeds_says_so_and_is_not_claimed_to_be_better(make_ru
     assert swapped.pairs[0].claimed == "a", "the worse one lost seeds"
 
 
-def test_a_run_that_diverged_at_once_or_over_another_horizon_has_no_curve(make_run: MakeRun):
+def test_a_run_that_diverged_at_once_or_over_another_horizon_has_no_curve(make_run: MakeRun, tmp_path: Path):
     long = replace(MAPPO, env=replace(MAPPO.env, max_cycles=75))
     runs = [
         make_run("a", VDN, HIGH),
@@ -342,6 +343,10 @@ def test_a_run_that_diverged_at_once_or_over_another_horizon_has_no_curve(make_r
     ]
     found = compare(runs)
     assert [group.evaluated_at for group in found.groups] == [EVALUATED_AT, (), ()]
+    page = write_page(found, tmp_path / "page").read_text(encoding="utf-8")
+    assert page.count("Without evaluations along training: b, c.") == 2 * 2, (
+        "in text and for screen readers, two metrics"
+    )
 
 
 def test_where_all_diverged_there_is_nothing_to_compare(make_run: MakeRun, refused: Callable[..., str]):

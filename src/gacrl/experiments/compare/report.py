@@ -115,6 +115,7 @@ def _figures(page: "Page", comparison: Comparison, metric: str, styles: "Mapping
     better = f"{'lower' if comparison.lower_is_better(metric) else 'higher'} is better"
     page.heading(_titled(comparison, metric))
     drawn = [group for group in groups if group.evaluated_at]
+    absent = [group.name for group in groups if not group.evaluated_at]
     if drawn:
         first = min(group.evaluated_at[0] for group in drawn)
         page.figure(
@@ -129,7 +130,8 @@ def _figures(page: "Page", comparison: Comparison, metric: str, styles: "Mapping
             ),
             f"Along training, {better}: interquartile mean over the seeds that trained so far with its 95 % interval, "
             f"and each seed as a thin line. The first evaluation is after {first:,} steps: before training there was "
-            "none. A cross marks where seeds end before others, or diverge; nothing is carried on behind it.",
+            "none. A cross marks where seeds end before others, or diverge; nothing is carried on behind it."
+            + (f" Without evaluations along training: {', '.join(absent)}." if absent else ""),
             f"{name}-curves",
         )
     page.figure(
