@@ -25,6 +25,7 @@ from gacrl.experiments.compare.finished import (
     flat,
     load,
     on_scale,
+    require_references,
     require_same_meaning,
     require_same_task,
 )
@@ -188,6 +189,7 @@ def compare(
         known = sorted(set.intersection(*(set(run.summary["final"][play]) for run in ended)))
         if metric not in known:
             raise UserError(unknown("metric", metric, known))
+        require_references(first, metric)
         require_same_meaning(loaded, metric)
     groups = grouped(loaded, metrics, play, labels, notes)
     differences = _differences(groups)
@@ -276,9 +278,10 @@ def _about_measurement(runs: Sequence[Finished]) -> Iterator[str]:
     episodes = sorted({run.summary["episodes"] for run in runs})
     if len(episodes) > 1:
         yield f"the closing evaluations have {' and '.join(map(str, episodes))} episodes: not the same starts"
-    versions = {run.summary.get("versions", {}).get("gacrl") for run in runs}
-    commits = {run.summary.get("versions", {}).get("git_commit") for run in runs}
-    if len(versions) > 1 or len(commits) > 1:
+    versions = {
+        json.dumps([run.summary.get("versions", {}).get(of) for of in ("gacrl", "git_commit")]) for run in runs
+    }
+    if len(versions) > 1:
         yield "the runs were made by different versions of gacrl"
 
 

@@ -54,18 +54,37 @@ def load(path: Path, warn: Warn) -> Finished:
     because = folder.why_diverged()
     if because is not None:
         rows = _rows(folder, warn)
-        measured = [name for row in rows[:1] for name in row.get("greedy", {})]
+        measured = [name for row in rows[:1] if isinstance(row.get("greedy"), dict) for name in row["greedy"]]
         facts, settings = _former_facts(config, measured), flat(configuration.to_dict(config))
         return Finished(path, config, settings, {}, facts, rows, because)
     if not folder.summary_file.exists():
         raise UserError(f"{path} has not ended, and has no summary.json: `gacrl resume {path}` ends it")
+    summary = _summary(folder, config)
+    facts = summary.get("task") or _former_facts(config, list(summary["final"]["greedy"]))
+    return Finished(path, config, flat(configuration.to_dict(config)), summary, facts, _rows(folder, warn))
+
+
+_SUMMARY = {"final": dict, "references": dict, "episodes": int, "horizon": int, "seeds": list}
+_FACTS = {
+    **{"name": str, "shown": dict, "comparable": dict, "defined_by": dict},
+    **{"scale": (list, type(None)), "lower_is_better": list},
+}
+
+
+def _summary(folder: RunFolder, config: RunConfig) -> dict[str, Any]:
+    """What `summary.json` says of a run that has ended."""
+    path = folder.path
     try:
         summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
-        shape = {"final": dict, "references": dict, "episodes": int, "horizon": int, "seeds": list}
-        if not all(isinstance(summary[name], kind) for name, kind in shape.items()):
+        if not all(isinstance(summary[name], kind) for name, kind in _SUMMARY.items()):
             raise ValueError("it lacks what a run's summary has")
         if not all(isinstance(summary["final"].get(play), dict) for play in get_args(Play)):
             raise ValueError("it lacks a closing evaluation")
+        facts = summary.get("task")
+        if facts and not all(isinstance(facts[name], kind) for name, kind in _FACTS.items()):
+            raise ValueError("it lacks facts of its task")
+        if not isinstance(summary.get("versions", {}), dict):
+            raise ValueError("its versions are none")
         planned = config.num_updates * config.steps_per_update
         if summary.get("env_steps", planned) != planned:
             raise UserError(
@@ -80,8 +99,7 @@ def load(path: Path, warn: Warn) -> Finished:
         raise UserError(f"a file of {path} is damaged, it is not text: {error}") from error
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise UserError(f"{folder.summary_file} is damaged: {error}") from error
-    facts = summary.get("task") or _former_facts(config, list(summary["final"]["greedy"]))
-    return Finished(path, config, flat(configuration.to_dict(config)), summary, facts, _rows(folder, warn))
+    return summary
 
 
 def _rows(folder: RunFolder, warn: Warn) -> list[dict[str, Any]]:
@@ -182,6 +200,20 @@ def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -
             if not math.isfinite(value):
                 raise UserError(f"{where} has {value} as {metric}: leave this run out, or compare another metric")
     return found
+
+
+def require_references(run: Finished, metric: str) -> None:
+    """Raises UserError where the summary of a run does not say what scripted policies get in a metric."""
+    references = run.summary["references"]
+    for who in references:
+        try:
+            if math.isfinite(on_scale(references[who], references, metric, run.facts["scale"])):
+                continue
+        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+            pass
+        raise UserError(
+            f"{run.path / 'summary.json'} does not say what {who} gets as {metric}: compare another metric"
+        )
 
 
 def on_scale(
