@@ -20,7 +20,7 @@ PACKAGE = Path(gacrl.__file__).parent
 
 LAYERS = (
     ("errors", "types", "versions", "config", "tasks", "tasks.spread.settings", "evaluation.statistics"),
-    ("cli.arguments", "envs", "messages.interventions", "networks", "report", "scene"),
+    ("cli.arguments", "cli.tables", "envs", "messages.interventions", "networks", "report", "scene"),
     ("tasks.own", "tasks.spread"),
     ("algorithms",),
     ("rollout",),

@@ -1,5 +1,7 @@
 """Statistics over seeds, against numbers worked out by hand and those of rliable."""
 
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -223,3 +225,50 @@ def test_equivalence_is_symmetric_and_holds_without_spread():
 def test_what_cannot_be_computed_is_said(call, sentence: str):
     with pytest.raises(UserError, match=sentence):
         call()
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("call", "place"),
+    [
+        (lambda: iqm([1, 2, NAN, 4]), "a score (seed 2) is not a finite number, but nan"),
+        (
+            lambda: iqm(np.array([[[1.0], [INF]]])),
+            "a score (sample 0, seed 1, task 0) is not a finite number, but inf",
+        ),
+        (lambda: mean([[1.0, 2.0], [3.0, -INF]]), "a score (seed 1, task 1) is not a finite number, but -inf"),
+        (lambda: median([NAN, 1.0]), "a score (seed 0) "),
+        (lambda: optimality_gap([1.0, NAN]), "a score (seed 1) "),
+        (lambda: optimality_gap([1.0], NAN), "the optimum of an optimality gap is not a finite number, but nan"),
+        (lambda: estimate([1.0, NAN]), "a score (seed 1) "),
+        (lambda: difference([1.0, 2.0], [NAN, 2.0]), "a score (seed 0) "),
+        (lambda: detectable([1.0, INF], [1.0, 2.0]), "a score (seed 1) "),
+        (lambda: probability_of_improvement([1.0, 2.0], [1.0, INF]), "a score (seed 1) "),
+        (lambda: equivalent([NAN, 2.0], [1.0, 2.0], 1.0), "a score (seed 0) "),
+        (lambda: equivalent([1.0, 2.0], [1.0, 2.0], INF), "the margin of an equivalence is not"),
+        (lambda: performance_profile([1.0, NAN], [0.0]), "a score (seed 1) "),
+        (lambda: performance_profile([1.0, 2.0], [0.0, NAN]), "a threshold (number 1) is not"),
+        (lambda: sample_efficiency([[1.0, 2.0], [3.0, NAN]]), "a score (seed 1, task 0, evaluation 1) "),
+    ],
+)
+def test_what_is_no_number_is_refused_with_its_place(call, place: str):
+    """Sorting takes NaN for the best score, and an interquartile mean would cut it off."""
+    with pytest.raises(ValueError) as caught:
+        call()
+    assert str(caught.value).startswith(place)
+    assert isinstance(caught.value, UserError)  # one sentence on the command line
+
+
+@pytest.mark.parametrize("statistic", [iqm, mean, median, optimality_gap])
+def test_nothing_has_no_mean(statistic):
+    with pytest.raises(UserError, match=r"one at the least, not of shape \[0, 1\]"):
+        statistic([])
+
+
+def test_statistics_load_nothing_that_takes_long():
+    """scipy.stats and scipy.optimize take longer to load than most comparisons to compute."""
+    code = "import sys, gacrl.evaluation.statistics; print([n for n in ('scipy.stats', 'scipy.optimize') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"

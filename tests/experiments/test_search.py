@@ -63,6 +63,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[float]:
                 [{"seed": s, "env_steps": steps, "greedy": {"coverage_final_0.1": v}} for s, v in rows]
             )
         if rate > 5e-3:
+            folder.write_diverged("seed 3 diverged: loss is nan by environment step 400")
             raise Diverged("seed 3 diverged: loss is nan by environment step 400; try a smaller one")
         folder.write_summary({})
         return Ended(out, config, 400, {})

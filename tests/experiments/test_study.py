@@ -1,6 +1,5 @@
 """A folder of planned runs: only what is missing is trained, and a run that diverged is a result."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from conftest import TinyRun
 from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.experiments.paper.evidence import read_series
-from gacrl.experiments.study import DIVERGED, Planned, Watch, train_missing
+from gacrl.experiments.study import Planned, Watch, train_missing, why_diverged
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
@@ -94,7 +93,7 @@ def test_only_what_is_missing_is_trained(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_a_run_that_diverged_is_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def diverge(config: RunConfig, out: Path, watcher: Watcher) -> None:
-        RunFolder.create(out, config)
+        RunFolder.create(out, config).write_diverged("loss is nan")  # as a session does
         raise Diverged("seed 0 diverged: loss is nan by environment step 9; try less")
 
     monkeypatch.setattr(session, "start", diverge)
@@ -102,5 +101,4 @@ def test_a_run_that_diverged_is_a_result(tmp_path: Path, monkeypatch: pytest.Mon
     assert train_missing([run], watched(said))
     assert train_missing([run], watched(said))
     assert said == [f"{run.name}: diverged", f"{run.name}: there already"]
-    because = json.loads((run.folder / DIVERGED).read_text(encoding="utf-8"))["because"]
-    assert because == "seed 0 diverged: loss is nan by environment step 9"
+    assert why_diverged(run.folder) == "loss is nan"

@@ -1,7 +1,9 @@
 """Pages and figures: complete, escaped, the same every time."""
 
+import re
 from collections.abc import Callable
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from gacrl.errors import UserError
-from gacrl.report import figures
+from gacrl.report import figures, figures_labels
 from gacrl.report.page import Page
 
 SVG = '<?xml version="1.0"?>\n<svg xmlns="http://www.w3.org/2000/svg"><defs><path id="p" d="M0 0"/></defs><g clip-path="url(#p)"/><use href="#p"/></svg>\n'
@@ -199,9 +201,106 @@ def test_a_grid_writes_every_number_but_empty_cells():
         figures.heat(np.zeros((2, 2)), ("p", ["a"]), ("r", ["a", "b"]), ("c", ["a", "b"]), "x")
 
 
-def test_colours_and_dashes_tell_many_apart():
-    looks = {figures._look(k) for k in range(28)}
-    assert len(looks) == 28
+def test_an_algorithm_has_one_colour_in_all_figures():
+    looks = figures.looks(["a", "b", "c"], {"a": "qmix", "b": "gacrl", "c": "own"})
+    assert (looks["a"].color, looks["b"].color) == (figures.COLORS["qmix"], figures.COLORS["gacrl"])
+    assert figures.looks(["GACRL", "mine"])["GACRL"].color == looks["b"].color
+    assert looks["c"].color in set(figures.PALETTE) - {looks["a"].color, looks["b"].color}
+    assert figures.looks(["x"], {"x": "gacrl"})["x"].color == looks["b"].color
+
+
+@pytest.mark.parametrize("kinds", [["gacrl"], ["gacrl", "vdn"], [f"own {k}" for k in range(40)]])
+def test_no_two_lines_look_alike(kinds: list[str]):
+    """Neighbours differ in dash and shape as well, for print without colours."""
+    names = [str(k) for k in range(40)]
+    looks = list(figures.looks(names, {name: kinds[k % len(kinds)] for k, name in enumerate(names)}).values())
+    assert len({(look.color, str(look.dash)) for look in looks}) == 40
+    for first, second in pairwise(looks):
+        assert first.dash != second.dash and first.shape != second.shape
+
+
+def markers(svg: str, name: str = "gacrl") -> int:
+    """How many markers of that algorithm are drawn; that in its label's sample is one."""
+    return len(re.findall(rf"<use [^>]*{figures.COLORS[name].lower()}", svg))
+
+
+def test_a_curve_of_a_single_evaluation_has_a_marker_and_its_interval():
+    other = {"vdn": (X, [1, 2, 3], None, None, None)}
+    assert markers(figures.curves({"gacrl": ([1000], [2.0], None, None, None), **other}, "x", "y")) == 2
+    with_seeds = figures.curves({"gacrl": ([1000], [2.0], [1.0], [3.0], [[1.0], [3.0]]), **other}, "x", "y")
+    assert markers(with_seeds) == 2 + 2, "the seeds are points"
+    assert with_seeds.count('id="LineCollection') == 1, "a band has no width there"
+
+
+def test_an_interval_between_gaps_is_drawn():
+    low, high = [0.0, np.nan, 2.0], [2.0, np.nan, 4.0]
+    lonely = figures.curves({"gacrl": (X, [1, 2, 3], low, high, None)}, "x", "y")
+    assert len(re.findall(r"<path [^>]*", lonely.split('id="LineCollection')[1].split("</g>")[0])) == 2
+
+
+def test_an_end_before_the_others_is_marked_and_nothing_is_carried_on():
+    def drawn(seeds: object, **more: object) -> int:
+        return markers(figures.curves({"gacrl": (X, [1, 2, 3], None, None, seeds)}, "x", "y", **more))
+
+    everywhere = drawn([[1, 2, 3], [1, 2, 3]])
+    assert everywhere == 3 + 1
+    assert drawn([[1, 2, 3], [1, 2, np.nan], [1, 2, np.nan]]) == everywhere + 1, "a cross where two end"
+    assert drawn([[1, 2, 3], [1, np.nan, np.nan], [1, 2, np.nan]]) == everywhere + 3, (
+        "and a seed that is one point"
+    )
+    assert drawn(None, stopped=["gacrl"]) == everywhere + 1
+
+
+def test_the_last_evaluation_of_a_long_curve_is_marked():
+    """So that the shape beside its label is found in the figure."""
+    many = list(range(100))
+    assert markers(figures.curves({"gacrl": (many, many, None, None, None)}, "x", "y")) == 2
+
+
+def words_at(svg: str) -> list[tuple[str, float, float]]:
+    """Every text with the place where it is written."""
+    found: list[tuple[str, float, float]] = []
+    for text in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"):
+        x, y = text.get("x"), text.get("y")
+        if x is None or y is None:
+            x, y = re.findall(r"-?[\d.]+", text.get("transform", ""))[:2]
+        found.append((text.text or "", float(x), float(y)))
+    return found
+
+
+def test_labels_do_not_lie_on_each_other():
+    """Thirty lines that end at one height, and references there too: each label has a line of its own."""
+    series = {f"run {k}": (X, [0, 0, 1 + k / 1e6], None, None, None) for k in range(30)}
+    lines = {"random": 1.0, "noop": 1.0, "oracle": 1.0}
+    words = words_at(figures.curves(series, "x", "y", lines))
+    heights = sorted(y for text, _, y in words if text in series or text in lines)
+    assert len(heights) == 33
+    assert min(np.diff(heights)) >= 9
+
+    names = [
+        (x, y) for text, x, y in words_at(figures.dots({"a": [1, 2]}, {"a": None}, "x", lines)) if text in lines
+    ]
+    assert len({y for _, y in names}) == 3, "at one place: above each other"
+    names = [
+        y
+        for text, _, y in words_at(figures.dots({"a": [1, 9]}, {"a": None}, "x", {"low": 1.0, "high": 9.0}))
+        if text in ("low", "high")
+    ]
+    assert len(set(names)) == 1, "far apart: side by side"
+
+
+@pytest.mark.parametrize("wanted", [[5.0, 5.0, 5.0], [0.0, 1.0, 98.0, 99.0, 100.0], [50.0, 52.0, 20.0], []])
+def test_labels_are_spread_as_little_as_it_takes(wanted: list[float]):
+    tall = np.full(len(wanted), 10.0)
+    found = figures_labels.spread(wanted, tall, 0.0, 100.0)
+    assert (np.diff(np.sort(found)) >= 10.0 - 1e-9).all()
+    assert ((found >= 5.0 - 1e-9) & (found <= 95.0 + 1e-9)).all()
+    assert [wanted[k] for k in np.argsort(found, kind="stable")] == sorted(wanted), "in the order of their lines"
+
+
+def test_a_row_without_seeds_says_that_it_diverged():
+    words = [text for text, _, _ in words_at(figures.dots({"a": [1, 2], "b": []}, {"a": None, "b": None}, "x"))]
+    assert words.count("diverged") == 1
 
 
 def test_drawing_leaves_the_users_settings_alone():

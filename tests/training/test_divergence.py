@@ -17,6 +17,7 @@ from gacrl.config import presets
 from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.training import build, session
 from gacrl.training.divergence import Diverged, not_finite
+from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
 from gacrl.types import Decision
 
@@ -71,6 +72,8 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     )
     assert [json.loads(line)["env_steps"] for line in (folder / "metrics.jsonl").read_text().splitlines()] == [18]
     assert [path.name for path in folder.glob("checkpoints/step-*")] == ["step-000000000018"]
+    because = "seed 7 diverged between environment steps 18 and 36: network['layer'] is inf in 1 of 6 places"
+    assert RunFolder(folder).why_diverged() == because, "a comparison can tell it from one that was stopped"
 
     before = content(folder)
     assert main(["resume", str(folder), "--diagnose", "--json"]) == 0
@@ -88,6 +91,11 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     }
     assert "seed 7: update 5, up to environment step 30, is the first bad one" in lines
     assert content(folder) == before, "nothing is written"
+
+    monkeypatch.setattr(build.build_algorithm, "make", lambda *_: breaking(at=100, loss=2.0))
+    monkeypatch.setattr(session, "make_trainer", functools.cache(build.make_trainer))
+    assert session.resume(folder).summary is not None
+    assert RunFolder(folder).why_diverged() is None, "it did not diverge this time"
 
 
 def test_what_is_not_finite_is_named():

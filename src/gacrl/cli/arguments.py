@@ -191,11 +191,12 @@ class Render:
 class Compare:
     """Compare finished runs: interquartile means over seeds with 95 % intervals, differences, chances to be better.
 
-    Runs that differ in the seed alone are one group. Settings that make a comparison unequal are named; runs
-    of other tasks, horizons or versions of the environment are refused.
+    Runs that differ in the seed alone are one group, named by their folders. Settings that make a comparison unequal
+    are named; runs of other tasks, horizons or versions of the environment are refused.
 
     examples:
       gacrl compare runs/mappo-1 runs/qmix-1
+      gacrl compare runs/mappo-1 runs/paper-1 --horizon 25 --label MAPPO "the paper's"
       gacrl compare runs/gacrl-1 runs/gacrl-2 runs/vdn-1 --metric coverage_final_0.1 --out runs/comparison
       gacrl compare runs/gacrl-1 runs/vdn-1 --metric coverage_final_0.1 --margin 0.02
     """
@@ -207,10 +208,16 @@ class Compare:
     outside: ON_TASK = Outside()
     margin: float | None = None
     """Also test whether groups differ by less than this, in the units of the one metric (two one-sided tests)."""
+    label: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
+    """What to call the runs, or the groups, in their order; none: the names of their folders."""
+    horizon: int | None = None
+    """Play runs that were evaluated over other horizons again, over this many steps."""
     sampled: bool = False
     """Compare the policies as they explore, instead of greedily."""
     out: Path | None = None
     """A folder for the comparison as a page (HTML and Markdown) with figures."""
+    csv: Path | None = None
+    """A file for every seed's value of every metric, a row each."""
     marl_eval: Path | None = None
     """A file to write the runs into as marl-eval's raw data."""
     overwrite: bool = False

@@ -349,18 +349,30 @@ def _compare(words: list[str]) -> int:
     from gacrl.experiments.compare import data as compare_data
     from gacrl.experiments.compare import report as compare_report
 
-    files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval]
+    files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval, asked.csv]
     for path in files:
         if path is not None and path.exists() and not asked.overwrite:
             raise UserError(f"{path} exists: choose another place, or say --overwrite")
     play = "sampled" if asked.sampled else "greedy"
-    comparison = compare.compare(asked.run, asked.metric, play, _warn, asked.margin)
-    compare_report.print_comparison(comparison)
+    if asked.horizon is not None:
+        from gacrl.training.devices import prepare_jax
+
+        prepare_jax()
+    labels = [name for names in asked.label for name in names]
+    comparison = compare.compare(asked.run, asked.metric, play, _warn, asked.margin, labels, asked.horizon)
+    # Files first: whoever reads the tables may stop, or not understand the characters.
+    written: list[str] = []
     if asked.out is not None:
-        print(f"page       {compare_report.write_page(comparison, asked.out)}")
+        written.append(f"page       {compare_report.write_page(comparison, asked.out)}")
     if asked.marl_eval is not None:
         asked.marl_eval.write_text(json.dumps(compare_data.to_marl_eval(comparison)) + "\n", encoding="utf-8")
-        print(f"marl-eval  {asked.marl_eval}")
+        written.append(f"marl-eval  {asked.marl_eval}")
+    if asked.csv is not None:
+        compare_data.write_csv(comparison, asked.csv)
+        written.append(f"csv        {asked.csv}")
+    compare_report.print_comparison(comparison)
+    for line in written:
+        print(line)
     if asked.json:
         print(json.dumps(compare_data.to_dict(comparison)))
     return 0

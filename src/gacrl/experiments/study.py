@@ -16,9 +16,6 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Ended
 from gacrl.training.watching import Watcher
 
-DIVERGED = "diverged.json"
-"""In the folder of a run that ended so: {because}."""
-
 
 @dataclass(frozen=True)
 class Planned:
@@ -31,7 +28,8 @@ class Planned:
     @property
     def finished(self) -> bool:
         """Nothing is left to do: it was trained to its end, or diverged."""
-        return any((self.folder / name).is_file() for name in ("summary.json", DIVERGED))
+        folder = RunFolder(self.folder)
+        return folder.summary_file.is_file() or folder.diverged_file.is_file()
 
 
 @dataclass(frozen=True)
@@ -57,9 +55,7 @@ def reading(folder: Path) -> Generator[None]:
 
 def why_diverged(folder: Path) -> str | None:
     """Why the run in that folder diverged; None for one that did not."""
-    path = folder / DIVERGED
-    with reading(folder):
-        return str(json.loads(path.read_text(encoding="utf-8"))["because"]) if path.is_file() else None
+    return RunFolder(folder).why_diverged()
 
 
 def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
@@ -72,9 +68,7 @@ def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
             if _train(planned, watch.run(planned.name)).summary is None:
                 return False
             watch.finished(planned.name, "done")
-        except Diverged as error:
-            text = json.dumps({"because": str(error).partition(";")[0]}) + "\n"
-            (planned.folder / DIVERGED).write_text(text, encoding="utf-8")
+        except Diverged:
             watch.finished(planned.name, "diverged")
         finally:
             release_memory()

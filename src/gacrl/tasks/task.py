@@ -64,7 +64,10 @@ def complete(settings: Settings) -> bool:
 
 HEADLINE = "return_agent_mean"
 RETURN: Mapping[str, Metric] = MappingProxyType(
-    {HEADLINE: Metric("reward_raw", "sum", label="return"), "reward_raw": Metric("reward_raw", "mean")}
+    {
+        HEADLINE: Metric("reward_raw", "sum", "reward per agent and episode", label="return"),
+        "reward_raw": Metric("reward_raw", "mean"),
+    }
 )
 """Every task has these: the mean over agents of what they earn, summed over the episode, and per step."""
 
@@ -147,6 +150,7 @@ class Task(NamedTuple):
             "headline": self.headline,
             "shown": self.shown(measured),
             "scale": ["random", next(iter(self.references))] if self.references else None,
+            "units": {name: metric.unit for name, metric in known.items() if metric.unit},
             "lower_is_better": [name for name, metric in known.items() if not metric.higher_is_better],
             "defined_by": {name: list(metric.defined_by) for name, metric in known.items() if metric.defined_by},
             "comparable": {name: getattr(settings, name) for name in names},

@@ -18,7 +18,8 @@ from gacrl.versions import version
 
 
 class RunFolder:
-    """`config.json`, `origin.json`, `metrics.jsonl`, `summary.json`, `checkpoints/` and `episodes/` of one run."""
+    """One run: `config.json`, `origin.json`, `metrics.jsonl`, `summary.json` or `diverged.json`, `checkpoints/` and
+    `episodes/`."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -26,6 +27,7 @@ class RunFolder:
         self.origin_file = path / "origin.json"
         self.metrics_file = path / "metrics.jsonl"
         self.summary_file = path / "summary.json"
+        self.diverged_file = path / "diverged.json"
         self.checkpoints = path / "checkpoints"
         self.episodes = path / "episodes"
         self.gif = path / "episodes.gif"
@@ -175,6 +177,21 @@ class RunFolder:
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Replace `summary.json`."""
         self._replace(self.summary_file, json.dumps(summary, indent=2) + "\n")
+
+    def write_diverged(self, because: str) -> None:
+        """Say in `diverged.json` that the run ended so."""
+        self._replace(self.diverged_file, json.dumps({"because": because}) + "\n")
+
+    def why_diverged(self) -> str | None:
+        """Why the run diverged; None where it did not. Raises UserError for a damaged file."""
+        if not self.diverged_file.is_file():
+            return None
+        try:
+            return str(json.loads(self.diverged_file.read_text(encoding="utf-8"))["because"])
+        except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+            raise UserError(
+                f"{self.diverged_file} is damaged: remove it, and `gacrl resume {self.path}` finds out again"
+            ) from error
 
     def _replace(self, path: Path, text: str) -> None:
         """Write a whole file so that a reader sees the old one or the new one, never half of it."""

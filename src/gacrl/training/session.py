@@ -170,6 +170,8 @@ def _run(
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
     try:
+        if leads():
+            folder.diverged_file.unlink(missing_ok=True)
         rows = folder.forget_metrics_after(env_steps) if leads() else 0
         if leads() and found is not None and rows != found.counters.get(ROWS, rows):
             watcher.warn(
@@ -194,6 +196,8 @@ def _run(
         summary = _finish(folder, config, trainer, state, env_steps, clock)
         watcher.finished(summary)
     except Diverged as error:
+        if leads():
+            folder.write_diverged(str(error).partition(";")[0])
         raise Diverged(
             f"{error}, or see the first bad update with `gacrl resume {folder.path}{again} --diagnose`, which begins "
             f"at {'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"

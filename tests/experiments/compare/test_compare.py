@@ -1,7 +1,11 @@
 """`gacrl compare` on small run folders made by hand: what is grouped, computed, noted and refused."""
 
+import csv
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gacrl import tasks
 from gacrl.cli.main import main
 from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.evaluation import statistics
+from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison, Pair, compare
 from gacrl.experiments.compare.data import to_dict, to_marl_eval
 from gacrl.experiments.compare.marl_eval import from_marl_eval
+from gacrl.experiments.compare.report import write_page
 
 REFERENCES = {
     who: {"return_agent_mean": value, "coverage_final_0.1": coverage, "collisions": 1.0}
@@ -101,7 +108,7 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(make_run: MakeRun):
     ]
     paths[1].joinpath("config.json").write_text(configuration.dumps(replace(VDN, num_seeds=3)))
     vdn, mappo = compare(paths).groups
-    assert (vdn.name, vdn.seeds, mappo.name) == ("vdn", (0, 1, 2, 3, 4), "mappo")
+    assert (vdn.name, vdn.seeds, mappo.name) == ("a + b", (0, 1, 2, 3, 4), "c")
     assert vdn.runs == (str(paths[0]), str(paths[1]))
     np.testing.assert_array_equal(vdn.final["return_agent_mean"], HIGH)
     np.testing.assert_array_equal(vdn.along["return_agent_mean"][4], np.array([-10.5, -9.5, -8.5]))
@@ -112,18 +119,18 @@ def test_the_numbers_are_those_of_the_statistics(make_run: MakeRun):
     assert found.groups[0].estimate("return_agent_mean") == statistics.estimate(HIGH)
     assert found.groups[0].point("return_agent_mean") == -8.0  # without the best and the worst seed
     (pair,) = found.pairs
-    assert (pair.a, pair.b, pair.point, pair.verdict, pair.claimed) == ("vdn", "mappo", 7.0, "higher", "vdn")
+    assert (pair.a, pair.b, pair.point, pair.verdict, pair.claimed) == ("a", "b", 7.0, "higher", "a")
     assert pair.difference == statistics.difference(HIGH, LOW)
     assert pair.better == (1.0, 1.0, 1.0)
     curve = found.groups[1].curve("return_agent_mean")
-    assert curve is not None
     np.testing.assert_allclose(curve.point, [-17.0, -16.0, -15.0])
+    np.testing.assert_array_equal(curve, statistics.sample_efficiency(found.groups[1].along["return_agent_mean"]))
 
 
 def test_where_lower_is_better_the_lower_one_improves(make_run: MakeRun):
     found = compare([make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW)], ["collisions"])
     assert found.pairs[0].verdict == "lower"
-    assert found.pairs[0].claimed == "vdn"
+    assert found.pairs[0].claimed == "a"
 
 
 def test_a_margin_tests_for_equivalence(
@@ -133,10 +140,7 @@ def test_a_margin_tests_for_equivalence(
     assert refused(*runs, "--margin", 2) == "a margin is in the units of a metric: name one with --metric"
     unusable = (runs[0], "--metric", "return_agent_mean", "--margin", -1)
     assert refused(*unusable) == "the margin of an equivalence must be positive, not -1.0"
-    for margin, told in (
-        (2.0, "; equivalent within 2 (p = "),
-        (0.2, "; not shown to be equivalent within 0.2 (p = "),
-    ):
+    for margin, told in ((2.0, "yes"), (0.2, "not shown")):
         words = ("--metric", "return_agent_mean", "--margin", str(margin), "--json")
         assert main(["compare", *map(str, runs), *words]) == 0
         said = capsys.readouterr().out
@@ -144,7 +148,10 @@ def test_a_margin_tests_for_equivalence(
         assert json.loads(said.splitlines()[-1])["pairs"][0]["equivalence"]["p_value"] == pytest.approx(
             expected.p_value
         )
-        assert told.strip("; ").split(" (")[0] in " ".join(said.split())
+        assert told in said and f"(p={expected.p_value:.2g})" in said
+        assert f"\nequivalent within {margin:g}: whether two one-sided tests show" in said, (
+            "explained where it stands"
+        )
 
 
 def test_few_seeds_give_no_verdict(make_run: MakeRun):
@@ -152,15 +159,17 @@ def test_few_seeds_give_no_verdict(make_run: MakeRun):
     assert found.pairs[0].difference is not None
     assert found.pairs[0].difference.low > 0
     assert (found.pairs[0].verdict, found.pairs[0].claimed) == ("too few seeds to tell", None)
-    assert "much too narrow to tell groups apart (vdn 2, mappo 3)" in " ".join(found.notes)
+    assert "much too narrow to tell groups apart (a 2, b 3)" in " ".join(found.notes)
 
 
 def test_a_single_seed_is_shown_without_an_interval(make_run: MakeRun):
     found = compare([make_run("a", VDN, HIGH[:1]), make_run("b", MAPPO, LOW)])
     assert found.groups[0].estimate("return_agent_mean") is None
-    assert found.groups[0].curve("return_agent_mean") is None
-    assert found.pairs[0] == Pair("vdn", "mappo", "return_agent_mean", 7.0, None, None, 1)
-    assert "a single seed has no interval: vdn" in found.notes
+    curve = found.groups[0].curve("return_agent_mean")
+    np.testing.assert_array_equal(curve.point, [-10.0, -9.0, -8.0])
+    assert np.isnan([curve.low, curve.high]).all()
+    assert found.pairs[0] == Pair("a", "b", "return_agent_mean", 7.0, None, None, 1)
+    assert "a single seed has no interval: a" in found.notes
     data = to_dict(found)
     assert data["groups"][0]["metrics"]["return_agent_mean"]["interval"] is None
     assert data["pairs"][0]["verdict"] is None
@@ -181,11 +190,11 @@ def test_unequal_switches_are_named(make_run: MakeRun):
     found = compare([make_run("plain", VDN, HIGH), make_run("turned", other, LOW)])
     assert found.unequal_switches == ("algorithm.network.torso", "algorithm.augment")
     assert (
-        "not at equal switches (algorithm.network.torso: mlp | graph; algorithm.augment: false | true)"
+        "settings that a fair comparison has equal (algorithm.network.torso: mlp | graph; algorithm.augment: false | true)"
         in noted(found)
     )
     assert found.config_differences["training.num_envs"] == (32, 8)
-    assert [group.name for group in found.groups] == ["vdn, plain", "vdn, turned"]
+    assert [group.name for group in found.groups] == ["plain", "turned"]
 
 
 def test_what_an_algorithm_lacks_is_no_switch_that_is_on(make_run: MakeRun):
@@ -197,10 +206,44 @@ def test_what_an_algorithm_lacks_is_no_switch_that_is_on(make_run: MakeRun):
     assert "algorithm.n_step" not in switches
 
 
-def test_groups_are_named_by_what_sets_them_apart(make_run: MakeRun):
+def names_of(found: Comparison) -> list[str]:
+    return [group.name for group in found.groups]
+
+
+def test_groups_are_named_by_their_folders(make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With as much of the path as tells them apart; of many runs the first names the group."""
     other = replace(VDN, algorithm=replace(VDN.algorithm, n_step=1))
-    found = compare([make_run("a", VDN, HIGH), make_run("b", other, LOW)])
-    assert [group.name for group in found.groups] == ["vdn, n step 3", "vdn, n step 1"]
+    (tmp_path / "old").mkdir()
+    (tmp_path / "new").mkdir()
+    runs = [make_run("old/vdn", VDN, HIGH), make_run("new/vdn", other, LOW), make_run("mappo-1", MAPPO, HIGH)]
+    runs += [make_run(f"mappo-{k}", MAPPO, HIGH, seed=5 * k) for k in (2, 3)]
+    assert names_of(compare(runs)) == ["old/vdn", "new/vdn", "mappo-1 + 2 more"]
+    monkeypatch.chdir(runs[0])
+    assert names_of(compare([Path(), Path("../../new/vdn"), runs[2]])) == ["old/vdn", "new/vdn", "mappo-1"]
+    assert names_of(compare([Path()])) == ["vdn"]
+
+
+def test_labels_name_the_runs_or_the_groups(
+    make_run: MakeRun, refused: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    runs = [make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW), make_run("c", VDN, LOW, seed=5)]
+    assert names_of(compare(runs, labels=["VDN", "MAPPO"])) == ["VDN", "MAPPO"]
+    assert names_of(compare(runs, labels=["VDN", "MAPPO", "again"])) == ["VDN + again", "MAPPO"]
+    words = [*map(str, runs), "--out", str(tmp_path / "page"), "--label", "the best", "--label", "MAPPO", "--json"]
+    assert main(["compare", *words]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [group["name"] for group in json.loads(said[-1])["groups"]] == ["the best", "MAPPO"]
+    page = (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8")
+    assert "<h1>Comparison of the best, MAPPO</h1>" in page
+    for figure in (tmp_path / "page" / "comparison-figures").iterdir():
+        assert ">the best<" in figure.read_text(encoding="utf-8"), figure.name
+    assert refused(*runs, "--label", "x") == (
+        "--label has 1 names for 3 runs in 2 groups (a + c; b): give one for each run, or one for each group"
+    )
+    assert (
+        refused(*runs, "--label", "x", "x")
+        == "--label 'x' stands for a + c and for b: give each a name of its own"
+    )
 
 
 def test_a_training_horizon_may_differ_where_the_evaluation_is_the_same(make_run: MakeRun):
@@ -223,7 +266,94 @@ def test_seeds_evaluated_unequally_often_share_a_curve_where_they_can(make_run: 
     assert found.groups[0].evaluated_at == (1000, 3000)
     assert found.groups[0].along["return_agent_mean"].shape == (10, 2)
     assert "3 times: seeds 0, 1, 2, 3, 4; 2 times: seeds 5, 6, 7, 8, 9" in noted(found)
-    assert "its curve is over the 2 environment steps that all its seeds share" in noted(found)
+    assert "its curve has 2 points, each over the seeds that trained so far" in noted(found)
+
+
+def test_a_curve_goes_on_with_the_seeds_that_trained_so_far(make_run: MakeRun):
+    """The interval is of those alone, and there is none of a single one; nothing is carried on behind an end."""
+    runs = [
+        make_run("a", VDN, HIGH[:1], evaluated_at=(1000, 2000, 3000)),
+        make_run("b", VDN, HIGH[1:3], seed=1, evaluated_at=(1000, 2000)),
+        make_run("c", VDN, HIGH[3:], seed=3, evaluated_at=(1000,)),
+    ]
+    (group,) = compare(runs).groups
+    assert group.evaluated_at == (1000, 2000, 3000)
+    assert group.reached().tolist() == [5, 3, 1]
+    curve = group.curve("return_agent_mean")
+    for k, left in enumerate((HIGH, HIGH[:3])):
+        expected = statistics.estimate(np.array(left) - 3 + (k + 1))
+        assert (curve.point[k], curve.low[k], curve.high[k]) == pytest.approx(expected)
+    assert curve.point[2] == HIGH[0] and np.isnan([curve.low[2], curve.high[2]]).all()
+    assert compare([*runs, make_run("d", VDN, HIGH, seed=9, evaluated_at=())]).groups[0].seeds[-1] == 13
+
+
+# Runs that diverged.
+
+
+def diverge(
+    run: Path, because: str = "seed 3 diverged between environment steps 2000 and 3000: loss is nan"
+) -> Path:
+    (run / "summary.json").unlink()
+    (run / "diverged.json").write_text(json.dumps({"because": because}))
+    return run
+
+
+def test_a_run_that_diverged_says_so_beside_the_others(
+    make_run: MakeRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    lost = diverge(make_run("wild", MAPPO, LOW, evaluated_at=(1000, 2000)))
+    out, table = tmp_path / "page", tmp_path / "values.csv"
+    words = ["compare", str(lost), str(make_run("calm", VDN, HIGH)), "--out", str(out), "--csv", str(table)]
+    assert main([*words, "--json"]) == 0
+    said = capsys.readouterr().out
+    data = json.loads(said.splitlines()[-1])
+    assert data["groups"][0]["seeds"] == [] and data["groups"][0]["lost_seeds"] == [0, 1, 2, 3, 4]
+    assert data["groups"][0]["metrics"]["return_agent_mean"]["point"] is None
+    assert data["groups"][0]["metrics"]["return_agent_mean"]["along"][0] == [-17.0, -16.0]
+    assert data["pairs"] == []
+    note = f"wild diverged and has no closing evaluation ({lost}: seed 3 diverged between environment steps 2000 and 3000"
+    assert note in data["notes"][-1]
+    assert re.search(r"wild +5 \(5 in a run that diverged\) +diverged +diverged", said)
+    page = (out / "comparison.html").read_text(encoding="utf-8")
+    assert "Wild diverged and has no closing evaluation" in page and "<td>diverged</td>" in page
+    assert ">diverged<" in (out / "comparison-figures" / "return_agent_mean-dots.svg").read_text(encoding="utf-8")
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    assert [str(lost), "wild", "4", "2000", "diverged", "return_agent_mean", "nan"] in rows
+    assert len(from_marl_eval(to_marl_eval(compare([Path(word) for word in words[1:3]])))) == 5
+
+
+def test_a_group_that_lost_seeds_says_so_and_is_not_claimed_to_be_better(make_run: MakeRun):
+    runs = [make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW)]
+    assert compare(runs, ["return_agent_mean"]).pairs[0].claimed == "a"
+    more = [*runs, diverge(make_run("c", VDN, [0.0, 0.0], seed=5, evaluated_at=(1000,)))]
+    found = compare(more, ["return_agent_mean"])
+    assert found.pairs[0].claimed is None
+    assert found.groups[0].lost == (5, 6) and found.groups[0].reached().tolist() == [7, 5, 5]
+    assert "2 of the 7 seeds of a + c are in a run that diverged" in noted(found)
+    swapped = compare([runs[0], runs[1], diverge(make_run("d", MAPPO, [0.0], seed=5))], ["return_agent_mean"])
+    assert swapped.pairs[0].claimed == "a", "the worse one lost seeds"
+
+
+def test_a_run_that_diverged_at_once_or_over_another_horizon_has_no_curve(make_run: MakeRun, tmp_path: Path):
+    long = replace(MAPPO, env=replace(MAPPO.env, max_cycles=75))
+    runs = [
+        make_run("a", VDN, HIGH),
+        diverge(make_run("b", long, LOW)),
+        diverge(make_run("c", MAPPO, LOW, evaluated_at=())),
+    ]
+    found = compare(runs)
+    assert [group.evaluated_at for group in found.groups] == [EVALUATED_AT, (), ()]
+    page = write_page(found, tmp_path / "page").read_text(encoding="utf-8")
+    assert page.count("Without evaluations along training: b, c.") == 2 * 2, (
+        "in text and for screen readers, two metrics"
+    )
+
+
+def test_where_all_diverged_there_is_nothing_to_compare(make_run: MakeRun, refused: Callable[..., str]):
+    run = diverge(make_run("a", VDN, HIGH), "loss is nan")
+    assert refused(run) == f"none of these runs came to its end: {run}: loss is nan"
+    (run / "diverged.json").write_text("{")
+    assert refused(run).startswith(f"{run / 'diverged.json'} is damaged")
 
 
 def test_a_line_that_a_crash_cut_off_is_dropped_with_a_warning(
@@ -235,13 +365,16 @@ def test_a_line_that_a_crash_cut_off_is_dropped_with_a_warning(
     assert main(["compare", str(run), "--json"]) == 0
     said = capsys.readouterr()
     assert said.err == f"gacrl: the last line of {metrics}, line 15, is cut off: compared without it\n"
-    assert json.loads(said.out.splitlines()[-1])["groups"][0]["env_steps"] == [1000, 2000]
+    data = json.loads(said.out.splitlines()[-1])
+    assert data["groups"][0]["env_steps"] == [1000, 2000, 3000]
+    assert data["groups"][0]["metrics"]["return_agent_mean"]["along"][4] == [-10.5, -9.5, None]
+    assert "3 times: seeds 0, 1, 2, 3; 2 times: seeds 4" in data["notes"][-1]
 
 
 def test_marl_eval_has_every_seed(make_run: MakeRun):
     found = compare([make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW[:2])])
     runs = from_marl_eval(to_marl_eval(found))
-    assert [(run.algorithm, run.run) for run in runs[4:6]] == [("vdn", "seed_4"), ("mappo", "seed_0")]
+    assert [(run.algorithm, run.run) for run in runs[4:6]] == [("a", "seed_4"), ("b", "seed_0")]
     assert {(run.environment, run.task) for run in runs} == {("spread", "3_agents_25_steps")}
     assert runs[0].env_steps == list(EVALUATED_AT)
     assert runs[0].metrics["return_agent_mean"] == [[-10.0], [-9.0], [-8.0]]
@@ -263,8 +396,15 @@ def test_the_command_prints_and_writes_everything(
     assert data["groups"][0]["metrics"]["return_agent_mean"]["values"] == [*HIGH, -9.0]
     assert data["references"]["oracle"] == {"return_agent_mean": -6.0, "coverage_final_0.1": 1.0}
     text = "\n".join(lines)
-    for said in ("Closing evaluations, greedy: 320 episodes of 25 steps", "-15.000 [", "higher", "note: "):
+    for said in (
+        "Closing evaluations, greedy: 320 episodes of 25 steps",
+        "-15.000 [",
+        "a + c is better",
+        "note: ",
+    ):
         assert said in text
+    for column in ("first less second", "would show from", "chance first is better", "shown better"):
+        assert f"\n{column}: " in text, "explained where it stands"
     page = (out / "comparison.html").read_text(encoding="utf-8")
     assert page.count("<figure>") == 6
     assert r"-15.000 \[" in (out / "comparison.md").read_text(encoding="utf-8")
@@ -279,6 +419,119 @@ def test_the_command_prints_and_writes_everything(
     assert f"{out / 'comparison.html'} exists" in capsys.readouterr().err
     assert main([*words, "--overwrite"]) == 0
     assert (out / "comparison.html").read_text(encoding="utf-8") == page
+
+
+def test_the_table_of_values_is_tidy(make_run: MakeRun, tmp_path: Path):
+    """Every metric, not only those compared, at every evaluation and at the end; scores along training as at the end."""
+    runs = [make_run("a", VDN, HIGH[:2]), make_run("b", MAPPO, LOW[:1], evaluated_at=(1000,))]
+    table = tmp_path / "values.csv"
+    words = ["--metric", "collisions", "--csv", str(table), "--label", "VDN, plain", "MAPPO"]
+    assert main(["compare", *map(str, runs), *words]) == 0
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == ("run", "label", "seed", "env_steps", "stage", "metric", "value")
+    found = {
+        (row["run"], row["seed"], int(row["env_steps"]), row["stage"], row["metric"]): float(row["value"])
+        for row in rows
+    }
+    assert len(found) == len(rows) == 2 * (3 * 5 + 4) + (5 + 4)
+    a, end = str(runs[0]), VDN.num_updates * VDN.steps_per_update
+    assert found[a, "1", 2000, "training", "return_agent_mean"] == -8.0
+    assert found[a, "1", 2000, "training", "score_return_agent_mean"] == pytest.approx(0.9)
+    assert found[a, "1", end, "closing", "return_agent_mean"] == -7.0
+    assert found[a, "1", end, "closing", "collisions"] == 7.0
+    assert {row["label"] for row in rows} == {"VDN, plain", "MAPPO"}
+    assert main(["compare", *map(str, runs), *words]) == 2, "it exists"
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 130])
+def test_no_number_is_cut_on_a_narrow_screen(
+    make_run: MakeRun, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Every number of the comparison is on some line, whole, and no line is wider than the screen."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    runs = [
+        make_run(name, config, values) for name, config, values in (("first", VDN, HIGH), ("second", MAPPO, LOW))
+    ]
+    assert main(["compare", *map(str, runs)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= columns
+    text = "\n".join(lines)
+    assert "…" not in text
+    found = compare(runs)
+    for group in found.groups:
+        for metric in found.metrics:
+            estimate = group.estimate(metric)
+            assert estimate is not None and with_interval(estimate) in text
+    for pair in found.pairs:
+        assert pair.difference is not None and pair.better is not None
+        assert with_interval(pair.difference) in text and with_interval(pair.better, ".2f") in text
+        assert re.search(rf"(?<![\d.]){pair.difference.detectable:.3f}(?![\d.])", text)
+
+
+def command(*words: object, **env: str) -> "subprocess.Popen[bytes]":
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "gacrl", "compare", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, **env},
+    )
+
+
+def test_the_page_survives_output_that_is_ascii_only(make_run: MakeRun, tmp_path: Path):
+    runs = make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW)
+    done = command(*runs, "--out", tmp_path / "page", "--label", "ε", "b", PYTHONIOENCODING="ascii")
+    said, wrong = done.communicate(timeout=60)
+    assert (done.returncode, wrong) == (0, b"")
+    assert b"| \\u03b5 | 5     | -8.000 [" in said
+    assert "ε" in (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8")
+
+
+def test_the_page_survives_a_closed_pipe(make_run: MakeRun, tmp_path: Path):
+    runs = make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW)
+    running = command(*runs, "--out", tmp_path / "page", "--csv", tmp_path / "values.csv", PYTHONUNBUFFERED="1")
+    assert running.stdout is not None and running.stderr is not None
+    running.stdout.close()
+    assert (running.stderr.read(), running.wait(timeout=60)) == (b"", 0)
+    running.stderr.close()
+    assert (tmp_path / "page" / "comparison.html").is_file() and (tmp_path / "values.csv").is_file()
+
+
+def test_a_comparison_loads_no_more_than_it_needs(make_run: MakeRun):
+    """Ten runs take well below three seconds: no jax, no scipy.stats, and matplotlib for a page alone."""
+    facts = tasks.find(VDN.task).facts(VDN.env, list(REFERENCES["random"]))
+    run = make_run("a", VDN, HIGH, task=facts)
+    code = (
+        "import sys; from gacrl.cli.main import main; main(sys.argv[1:]);"
+        "print([name for name in ('jax', 'scipy.stats', 'scipy.optimize', 'matplotlib') if name in sys.modules])"
+    )
+    words = [sys.executable, "-c", code, "compare", str(run)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_axes_of_figures_are_words_with_units(make_run: MakeRun, tmp_path: Path):
+    facts = tasks.find(VDN.task).facts(VDN.env, list(REFERENCES["random"]))
+    run, out = make_run("a", VDN, HIGH, task=facts), tmp_path / "page"
+    words = [
+        word
+        for name in ("return_agent_mean", "coverage_final_0.1", "score_return_agent_mean")
+        for word in ("--metric", name)
+    ]
+    assert main(["compare", str(run), *words, "--out", str(out)]) == 0
+    for file, axis in (
+        ("return_agent_mean-curves", "return (reward per agent and episode)"),
+        ("coverage_final_0-1-profile", "coverage 0.1 (share of landmarks)"),
+        ("score_return_agent_mean-dots", "score of return (0: random, 1: oracle)"),
+    ):
+        assert f">{axis}<" in (out / "comparison-figures" / f"{file}.svg").read_text(encoding="utf-8")
+    curves = (out / "comparison-figures" / "return_agent_mean-curves.svg").read_text(encoding="utf-8")
+    assert ">environment steps of each seed<" in curves
+    assert (
+        "The first evaluation is after 1,000 steps: before training there was none."
+        in (out / "comparison.md").read_text()
+    )
 
 
 def test_a_page_of_single_seeds(make_run: MakeRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -298,7 +551,12 @@ def env_of(config: RunConfig, **changes: Any) -> RunConfig:
 @pytest.mark.parametrize(
     ("config", "summary", "metric", "sentence"),
     [
-        (env_of(MAPPO, max_cycles=75), {}, "collisions", "evaluated over 25 steps, .* over 75, and returns"),
+        (
+            env_of(MAPPO, max_cycles=75),
+            {},
+            "collisions",
+            "over 25 steps, .* over 75, and returns .*: --horizon 25 plays",
+        ),
         (env_of(MAPPO, num_agents=5), {}, "collisions", "different tasks, env.num_agents is 3 in one and 5"),
         (env_of(MAPPO, arena_scale=2.0), {}, "collisions", "env.arena_scale is 1.0 in one and 2.0"),
         (MAPPO, {"versions": {"mpe2": "1.0.0"}}, "collisions", "measured with MPE2 1.1.1, .* with 1.0.0"),

@@ -24,7 +24,7 @@ from gacrl.experiments.paper.claims import Claim, Reading, claims, measures
 from gacrl.experiments.paper.evidence import Evidence, Reference, Series, blocks
 from gacrl.experiments.paper.reproduce import at_paper_budget, plan
 from gacrl.experiments.paper.verdicts import judge, judge_all
-from gacrl.experiments.study import DIVERGED, Planned
+from gacrl.experiments.study import Planned
 from gacrl.networks.agent import acting_parameters, matched
 from gacrl.tasks.spread.settings import METRICS, SpreadSettings
 from gacrl.training.recorder import RunFolder
@@ -417,8 +417,7 @@ def test_the_command_writes_a_report_that_has_every_claim(
     (out / "reproduce.json").write_text('{"seeds": 2, "episodes": 1500}', encoding="utf-8")
     for (column, who), run in plan(out, seeds=2, extended=True).items():
         if (column, who) == ("mpe2", "GACRL"):
-            RunFolder.create(run.folder, run.config)
-            (run.folder / DIVERGED).write_text('{"because": "loss is nan"}', encoding="utf-8")
+            RunFolder.create(run.folder, run.config).write_diverged("loss is nan")
         else:
             pretend(run, 5.0 if who == "MAPPO" else 0.0)
     assert main(["reproduce", "--seeds", "2", "--extended", "--out", str(out), "--json"]) == 0

@@ -1,11 +1,23 @@
-"""A comparison as plain data: ours, and marl-eval's."""
+"""A comparison as plain data: ours, marl-eval's, and a tidy table of every seed's every value."""
 
-from collections.abc import Sequence
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gacrl.errors import UserError
 from gacrl.evaluation.statistics import Difference, Estimate
 from gacrl.experiments.compare import marl_eval
-from gacrl.experiments.compare.compare import Comparison, Group
+from gacrl.experiments.compare.compare import Comparison
+from gacrl.experiments.compare.finished import Finished, Play, with_scores
+from gacrl.experiments.compare.groups import Group
+
+COLUMNS = ("run", "label", "seed", "env_steps", "stage", "metric", "value")
+"""Of the tidy table."""
 
 
 def to_dict(comparison: Comparison) -> dict[str, Any]:
@@ -57,8 +69,13 @@ def to_marl_eval(comparison: Comparison) -> dict[str, Any]:
                 task=task,
                 algorithm=group.name,
                 run=f"seed_{seed}",
-                env_steps=group.evaluated_at,
-                metrics={name: [[value] for value in values[k]] for name, values in group.along.items()},
+                env_steps=[
+                    step for step, there in zip(group.evaluated_at, _there(group, k), strict=True) if there
+                ],
+                metrics={
+                    name: [[value] for value in values[k][_there(group, k)]]
+                    for name, values in group.along.items()
+                },
                 absolute={name: [values[k]] for name, values in group.final.items()},
             )
             for group in comparison.groups
@@ -67,18 +84,62 @@ def to_marl_eval(comparison: Comparison) -> dict[str, Any]:
     )
 
 
+def write_csv(comparison: Comparison, path: Path) -> None:
+    """Write every seed's value of every metric, at each evaluation along training and the closing one, as a row.
+
+    Its columns are COLUMNS. stage: training, closing, or diverged for a seed without a closing evaluation, whose values
+    there are nan. Raises UserError for what is no number, and OSError where the file cannot be written.
+    """
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for group in comparison.groups:
+            for run in group.members:
+                try:
+                    values = list(_values(run, comparison.play, comparison.metrics))
+                except (KeyError, IndexError, TypeError, ValueError) as error:
+                    what = f"{type(error).__name__}: {error}"
+                    raise UserError(f"{run.path} holds an evaluation with what is no number ({what})") from error
+                table.writerows((run.path, group.name, *value) for value in values)
+
+
+def _values(run: Finished, play: Play, compared: Sequence[str]) -> Iterator[tuple[int, int, str, str, float]]:
+    """Seed, environment steps, stage, metric and value of all that was measured of a run."""
+    references, scale = run.summary["references"], run.facts["scale"]
+    for row in run.rows:
+        for metric, value in with_scores(row[play], references, scale).items():
+            yield row["seed"], row["env_steps"], "training", metric, value
+    final: Mapping[str, Any] = run.summary["final"][play] if run.diverged is None else {}
+    end = run.config.num_updates * run.config.steps_per_update
+    for member, seed in enumerate(run.config.seeds):
+        for metric, entry in final.items():
+            yield seed, end, "closing", metric, float(entry["values"][member])
+        if run.diverged is not None:
+            last = max((row["env_steps"] for row in run.rows if row["seed"] == seed), default=0)
+            yield from ((seed, last, "diverged", metric, math.nan) for metric in compared)
+
+
+def _there(group: Group, k: int) -> NDArray[np.bool_]:
+    """At which steps the k-th of its seeds was evaluated [P]."""
+    return np.isfinite(next(iter(group.along.values()))[k])
+
+
 def _group_data(group: Group, metrics: Sequence[str]) -> dict[str, Any]:
     return {
         "name": group.name,
         "runs": list(group.runs),
         "seeds": list(group.seeds),
+        "lost_seeds": list(group.lost),
+        "diverged": list(group.diverged),
         "env_steps": list(group.evaluated_at),
         "metrics": {
             metric: {
                 "point": group.point(metric),
                 "interval": _bounds(group.estimate(metric)),
                 "values": group.final[metric].tolist(),
-                "along": group.along[metric].tolist(),
+                "along": [
+                    [None if math.isnan(value) else value for value in seed] for seed in group.along[metric]
+                ],
             }
             for metric in metrics
         },

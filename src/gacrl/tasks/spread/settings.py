@@ -99,20 +99,21 @@ COMPARABLE = (
 
 _RADII = ("0.1", "0.2", "0.5")
 _SHAPED_BY = ("local_ratio", "coverage_threshold", "collision_term", "collision_distance")
+_SHARE = "share of landmarks"
 _LABELS = {"0.1": "coverage 0.1", "0.2": "coverage 0.2", "0.5": ""}
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
         # MPE2's own reward at local ratio 0.5, the mean over agents: summed, and per step.
-        "return_agent_mean": Metric("reward_raw", "sum", label="return"),
+        "return_agent_mean": Metric("reward_raw", "sum", "reward per agent and episode", label="return"),
         "reward_raw": Metric("reward_raw", "mean"),
         # The paper's equation (1), the team's reward per step.
         "reward_shaped": Metric("reward_shaped", "mean", defined_by=_SHAPED_BY),
         # Fraction of landmarks with an agent within the radius.
-        **{f"coverage_mean_{r}": Metric(f"coverage_{r}", "mean") for r in _RADII},
-        **{f"coverage_final_{r}": Metric(f"coverage_{r}", "last", label=_LABELS[r]) for r in _RADII},
-        "coverage_mean_theta": Metric("coverage_theta", "mean", defined_by=("coverage_threshold",)),
-        "success_final_0.1": Metric("success_0.1", "last", label="all covered"),
+        **{f"coverage_mean_{r}": Metric(f"coverage_{r}", "mean", _SHARE) for r in _RADII},
+        **{f"coverage_final_{r}": Metric(f"coverage_{r}", "last", _SHARE, label=_LABELS[r]) for r in _RADII},
+        "coverage_mean_theta": Metric("coverage_theta", "mean", _SHARE, defined_by=("coverage_threshold",)),
+        "success_final_0.1": Metric("success_0.1", "last", "share of episodes", label="all covered"),
         # Arena units.
         "distance_agent_landmark": Metric("distance_agent_landmark", "mean", "arena units", False),
         "distance_landmark_agent": Metric("distance_landmark_agent", "mean", "arena units", False, "distance"),
