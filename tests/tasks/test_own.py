@@ -64,7 +64,7 @@ class Walk(Environment):
 def test_a_class_an_instance_and_a_record_are_tasks(thing: Any):
     name, settings = own.bring(thing)
     assert (name, settings) == ("Walk", Walk())
-    assert tasks.names() == ["spread", "Walk"]
+    assert tasks.names()[-1] == "Walk"
     assert tasks.find(name).make(settings) == Walk()
 
 
