@@ -72,12 +72,17 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
 
 
 def on_task(config: RunConfig, name: str) -> RunConfig:
-    """The same on another task, with that one's own settings; as it is where the task is the same.
+    """Return the configuration for another task, with that task's settings, and memory where the task needs it.
 
-    Raises ConfigError for a task that is not at hand.
+    As it is where the task is the same. Raises ConfigError for a task that is not at hand.
     """
-    settings = tasks.default_settings(name)
-    return config if name == config.task else replace(config, task=name, env=settings)
+    if name == config.task:
+        return config
+    on = replace(config, task=name, env=tasks.default_settings(name))
+    network = getattr(config.algorithm, "network", None)
+    if network is None or not tasks.find(name).needs_memory:
+        return on
+    return replace(on, algorithm=replace(config.algorithm, network=replace(network, recurrent=True)))
 
 
 def changed(settings: Any, changes: Mapping[str, Any]) -> Any:

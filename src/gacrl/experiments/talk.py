@@ -1,0 +1,270 @@
+"""Does a task need talk, and do the agents use it? Silent, talking and told learners at equal steps and sizes.
+
+Each learner is a run folder of its own, so that a stopped study resumes with what is missing. The talking learner is
+then played with its messages silenced, scrambled and delayed: only that shows whether anybody listens.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gacrl import tasks
+from gacrl.algorithms.actions import choices
+from gacrl.config import files as configuration
+from gacrl.config.run import RunConfig
+from gacrl.errors import UserError
+from gacrl.evaluation.statistics import Difference, Estimate, difference, estimate, mean, with_interval
+from gacrl.experiments import scoring
+from gacrl.experiments.study import (
+    Planned,
+    Watch,
+    claim_folder,
+    refuse_other_settings,
+    train_missing,
+    why_diverged,
+)
+from gacrl.messages import interventions
+from gacrl.networks.agent import acting_parameters, matched
+from gacrl.report import figures
+from gacrl.report.page import Page
+from gacrl.tasks.task import HEADLINE, Task
+
+SILENT, TALKING, TOLD = LEARNERS = ("silent", "talking", "told")
+_HEARD: Mapping[str, str] = MappingProxyType(
+    {
+        SILENT: "nobody hears anybody",
+        TALKING: "agents send symbols",
+        TOLD: "agents hear what their neighbours see",
+    }
+)
+_KINDS: Mapping[str, str] = MappingProxyType({SILENT: "none", TALKING: "discrete", TOLD: "told"})
+SENT, SCRAMBLED = "as sent", "scrambled"
+PLAYED: Mapping[str, str] = MappingProxyType(
+    {SENT: "", "silenced": "silence", SCRAMBLED: "scramble", "a step late": "delay 1"}
+)
+"""What happens to the talking learner's messages, and the intervention that does it."""
+ENV_STEPS = 40_000
+EVALUATIONS = 8
+MATTERS = 0.05
+"""The share of a gain that counts: of what told agents gain, and of what learning gains at all."""
+
+
+class Answer(NamedTuple):
+    """Whether a task needs talk, and whether the agents use it; in returns, over seeds."""
+
+    worth: Difference
+    """Told less silent."""
+    used: Estimate
+    """The talking learner, as sent less scrambled across episodes, seed by seed."""
+    random: float
+    needs: bool
+    """The lower bound of `worth` is above 5 % of what silent agents gain over random ones."""
+    uses: bool
+    """The lower bound of `used` is above 5 % of what told agents gain over silent ones."""
+
+
+@dataclass(frozen=True)
+class Talk:
+    """A finished study of one task."""
+
+    out: Path
+    report: Path
+    config: RunConfig
+    parameters: Mapping[str, int]
+    """Of each learner's acting network."""
+    returns: Mapping[str, NDArray[np.float64]]
+    """Of each learner, greedy, last parameters: a number for each seed [S]."""
+    played: Mapping[str, NDArray[np.float64]]
+    """Of the talking learner by what happens to its messages [S]."""
+    answer: Answer
+
+    @property
+    def task(self) -> Task:
+        """What was learned."""
+        return tasks.find(self.config.task)
+
+    @property
+    def sentence(self) -> str:
+        """The answer in words, with intervals."""
+        worth, used = self.answer.worth, self.answer.used
+        gained = with_interval(worth, ".2f")
+        if not self.answer.needs:
+            return (
+                f"{self.task.name} needs no talk that {len(self.returns[TOLD])} seeds can show: agents that are told "
+                f"what others see earn {gained} more than silent ones. Scrambling their words costs talking agents "
+                f"{with_interval(used, '.2f')}."
+            )
+        share = f", {100 * used.point / worth.point:.0f} % of that"
+        verdict = "use it" if self.answer.uses else "do not use it"
+        return (
+            f"{self.task.name} needs talk: agents that are told what others see earn {gained} more than silent ones. "
+            f"These agents {verdict}: scrambling their words costs them {with_interval(used, '.2f')}{share}."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all of it as plain data."""
+        answer = self.answer
+        return {
+            "out": str(self.out),
+            "report": str(self.report),
+            "task": self.task.name,
+            "config": configuration.to_dict(self.config),
+            "parameters": dict(self.parameters),
+            "returns": {name: values.tolist() for name, values in self.returns.items()},
+            "played": {name: values.tolist() for name, values in self.played.items()},
+            "worth": list(answer.worth[:3]),
+            "used": list(answer.used),
+            "random": answer.random,
+            "needs_talk": answer.needs,
+            "uses_talk": answer.uses,
+            "sentence": self.sentence,
+        }
+
+
+def talk(
+    config: RunConfig, out: Path, seeds: int = 3, env_steps: int = ENV_STEPS, watch: Watch | None = None
+) -> Talk | None:
+    """Train what is missing under `out`, play it, and write `report.html`, `report.md` and `summary.json` there.
+
+    config: of the talking learner. Returns None where the watcher's stop ended it early. Raises UserError for fewer
+    than two seeds, a single agent, a preset whose agents cannot talk, or a folder that holds something else.
+    """
+    watch = watch or Watch()
+    if seeds < 2:
+        raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
+    runs = plan(_talking(config, seeds, env_steps), out)
+    asked = {"config": configuration.to_dict(runs[1].config)}
+    claim_folder(out, "talk.json", asked, "study of talk", lambda held: "another study: choose another --out")
+    refuse_other_settings(runs)
+    watch.planned([run.name for run in runs])
+    if not train_missing(runs, watch):
+        return None
+    watch.say("playing with silenced, scrambled and late messages")
+    done = _read(out, runs)
+    page = _report(done)
+    done = replace(done, report=page.write(out, "report"))
+    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    return done
+
+
+def plan(config: RunConfig, out: Path) -> list[Planned]:
+    """Plan the three learners. The silent and the told one are as large as the talking one."""
+    wanted = _num_parameters(config)
+    runs: list[Planned] = []
+    for name in LEARNERS:
+        changes = {"communication": _KINDS[name], **({} if name == TALKING else {"parameters": wanted})}
+        changed = configuration.from_dict({"algorithm": {"network": changes}}, config)
+        runs.append(Planned(name, changed, out / name))
+    return runs
+
+
+def answer(
+    returns: Mapping[str, NDArray[np.float64]], played: Mapping[str, NDArray[np.float64]], random: float
+) -> Answer:
+    """Judge the returns [S] of the learners, of the talking one by what happens to its messages, and of random."""
+    worth = difference(returns[TOLD], returns[SILENT], mean)
+    used = estimate(played[SENT] - played[SCRAMBLED], mean)
+    learned = float(returns[SILENT].mean()) - random
+    needs = worth.low > MATTERS * max(learned, 0.0)
+    return Answer(worth, used, random, needs, used.low > MATTERS * max(worth.point, 0.0))
+
+
+def _talking(config: RunConfig, seeds: int, env_steps: int) -> RunConfig:
+    """The settings of the talking learner. Raises UserError for what cannot talk."""
+    network = getattr(config.algorithm, "network", None)
+    if network is None:
+        raise UserError(
+            f"--preset {config.preset} has a network of its own: name one whose messages can be chosen"
+        )
+    env = tasks.find(config.task).make(config.env)
+    if env.num_agents < 2:
+        raise UserError(f"{config.task} has a single agent: nobody is there to talk to")
+    changes = {
+        "num_seeds": seeds,
+        "algorithm": {"network": {"communication": _KINDS[TALKING]}},
+        "training": {"env_steps": env_steps},
+        "evaluation": {"interval": max(env_steps // EVALUATIONS, 1)},
+    }
+    return configuration.from_dict(changes, config)
+
+
+def _num_parameters(config: RunConfig) -> int:
+    env = tasks.find(config.task).make(config.env)
+    actions = choices(env).size
+    network = matched(env, config.algorithm.network, actions)  # pyright: ignore[reportAttributeAccessIssue] checked
+    return acting_parameters(env, network, actions)
+
+
+def _read(out: Path, runs: Sequence[Planned]) -> Talk:
+    """Play the finished learners."""
+    for run in runs:
+        because = why_diverged(run.folder)
+        if because is not None:
+            raise UserError(f"there is no answer: the {run.name} learner {because}")
+    config = runs[LEARNERS.index(TALKING)].config
+    episodes = config.evaluation.final_episodes
+    returns = {run.name: _returns(str(run.folder), episodes) for run in runs}
+    talking = str(runs[LEARNERS.index(TALKING)].folder)
+    played = {name: _returns(talking, episodes, how) if how else returns[TALKING] for name, how in PLAYED.items()}
+    unscripted = scoring.play("random", episodes, lambda _: config.env, task=config.task)
+    random = float(unscripted[HEADLINE].mean())
+    parameters = {run.name: _num_parameters(run.config) for run in runs}
+    return Talk(out, out / "report.html", config, parameters, returns, played, answer(returns, played, random))
+
+
+def _returns(run: str, episodes: int, intervention: str = "") -> NDArray[np.float64]:
+    """The return of each seed [S], greedy."""
+    return scoring.play(run, episodes, intervention=interventions.parse(intervention))[HEADLINE].mean(1)
+
+
+def _report(done: Talk) -> Page:
+    page, config = Page(f"Does {done.task.name} need talk?"), done.config
+    page.text(done.sentence)
+    page.table(
+        ("learner", "what agents hear", "parameters", "return per agent", "every seed"),
+        [
+            [name, _HEARD[name], f"{done.parameters[name]:,}", *_cells(values)]
+            for name, values in done.returns.items()
+        ],
+        f"{config.preset} on {done.task.name}: {config.training.env_steps:,} environment steps a seed, "
+        f"{config.num_seeds} seeds from {config.seed}. Return of {config.evaluation.final_episodes} fixed episodes, "
+        f"greedy, last parameters; mean over seeds and its 95 % bootstrap interval. Random agents: "
+        f"{done.answer.random:.2f}.",
+    )
+    page.table(
+        ("messages", "return per agent", "every seed"),
+        [[name, *_cells(values)] for name, values in done.played.items()],
+        "The same talking agents, by what happens to their messages. Scrambled: every agent is heard with its words "
+        "from another episode.",
+    )
+    page.figure(
+        figures.dots(
+            {**done.returns, **{f"talking, {name}": v for name, v in done.played.items() if name != SENT}},
+            {
+                **{name: estimate(values, mean) for name, values in done.returns.items()},
+                **{f"talking, {n}": estimate(values, mean) for n, values in done.played.items() if n != SENT},
+            },
+            "return per agent",
+            {"random": done.answer.random},
+        ),
+        "Every seed is a dot, below them the mean and its 95 % interval.",
+        "returns",
+    )
+    page.heading("How this is judged")
+    page.text(
+        "A task needs talk where the lower bound of told − silent is above 5 % of what silent agents gain over random "
+        "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
+    )
+    words = f"gacrl talk{tasks.flag(config.task)} --preset {config.preset} --seeds {config.num_seeds}"
+    page.code(f"{words} --seed {config.seed} --env-steps {config.training.env_steps}")
+    return page
+
+
+def _cells(values: NDArray[np.float64]) -> list[str]:
+    return [with_interval(estimate(values, mean), ".2f"), " ".join(f"{value:.2f}" for value in values)]
