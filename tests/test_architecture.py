@@ -18,10 +18,13 @@ from gacrl.tasks.spread.settings import SpreadSettings
 
 PACKAGE = Path(gacrl.__file__).parent
 
+TASKS = tuple(f"tasks.{path.parent.name}" for path in sorted((PACKAGE / "tasks").glob("*/settings.py")))
+SETTINGS_OF_TASKS = tuple(f"{task}.settings" for task in TASKS)
+
 LAYERS = (
-    ("errors", "types", "versions", "config", "tasks", "tasks.spread.settings", "evaluation.statistics"),
+    ("errors", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
     ("cli.arguments", "cli.tables", "envs", "messages.interventions", "networks", "report", "scene"),
-    ("tasks.own", "tasks.spread"),
+    ("tasks.own", *TASKS),
     ("algorithms",),
     ("rollout",),
     ("evaluation",),
