@@ -23,6 +23,7 @@ _OURS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
         "speaker_listener": ("gacrl.tasks.navigation", "SpeakerListenerSettings", "SPEAKER_LISTENER"),
         "reference": ("gacrl.tasks.navigation", "ReferenceSettings", "REFERENCE"),
         "colours": ("gacrl.tasks.navigation", "ColoursSettings", "COLOURS"),
+        "traffic_junction": ("gacrl.tasks.traffic", "TrafficSettings", "TASK"),
     }
 )
 """Per name: the folder, whose `settings` hold a class of this name, and whose `task` holds this record."""
