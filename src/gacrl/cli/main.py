@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gacrl.experiments.search import Search
     from gacrl.experiments.study import Watch
     from gacrl.training.session import Ended
-from gacrl.training.watching import Watcher
+    from gacrl.training.watching import Watcher
 
 OVERVIEW = """\
 gacrl: learning to coordinate by communicating over a graph
