@@ -330,13 +330,14 @@ def _render(words: _Words) -> int:
     from gacrl import render
     from gacrl.experiments import scoring
 
+    out = asked.out.absolute()  # a task may change the folder of the process
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
     shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task)
     if shown.episodes[0].scene is None:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )
-    render.gif(shown.episodes, asked.out, size=asked.size, title=asked.run, words=shown.task.words)
+    render.gif(shown.episodes, out, size=asked.size, title=asked.run, words=shown.task.words)
     print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}")
     return 0
 

@@ -132,7 +132,7 @@ def ablate(
     the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
     not GACRL's, or a folder that holds something else.
     """
-    watch, seeds = watch or Watch(), whole(seeds, "seeds")
+    watch, seeds, out = watch or Watch(), whole(seeds, "seeds"), out.absolute()
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if not isinstance(config.algorithm, GacrlConfig):

@@ -244,6 +244,7 @@ def claim(spec: Spec, out: Path, proposed_by: str) -> None:
 
 def search(spec: Spec, out: Path, watch: Watch) -> Search | None:
     """Train what is missing under `out`, here; None where the watcher stopped it. Raises UserError."""
+    out = out.absolute()
     claim(spec, out, "Halton")
     planned = [spec.trial(out, values) for values in proposals(spec)]
     watch.planned([trial.name for trial in planned])

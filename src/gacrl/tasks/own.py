@@ -58,7 +58,7 @@ def _by_name(name: str) -> str:
     if not colon or not path.endswith(".py"):
         tasks.find(name)
         return name
-    source = Path(path)
+    source = Path(path).absolute()  # wherever the process goes later
     with blamed(source):
         thing = _load(source, attribute)
         own = _with_plain_numbers(_record(thing, attribute))
@@ -85,7 +85,7 @@ def run_file(source: Path) -> Any:
     except OSError as error:
         raise ConfigError(f"cannot read {source}: {reason(error)}") from error
     name = f"gacrl_own_{hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]}"
-    spec = importlib.util.spec_from_file_location(name, source)
+    spec = importlib.util.spec_from_file_location(name, source.absolute())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
@@ -151,6 +151,7 @@ def _default(kind: type, name: str) -> Any:
 @contextlib.contextmanager
 def blamed(source: Path | None) -> Generator[None]:
     """Raises ConfigError, with file, line and message, for what code of that file raises."""
+    file = None if source is None else source.resolve()
     try:
         yield
     except (UserError, KeyboardInterrupt, GeneratorExit):
@@ -158,14 +159,10 @@ def blamed(source: Path | None) -> Generator[None]:
     except BaseException as error:
         if source is None:
             raise
-        if (
-            isinstance(error, SyntaxError)
-            and error.filename
-            and Path(error.filename).resolve() == source.resolve()
-        ):
+        if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == file:
             raise ConfigError(f"{source}:{error.lineno}: {error.msg}") from error
         frames = traceback.extract_tb(error.__traceback__)
-        mine = [frame for frame in frames if Path(frame.filename).resolve() == source.resolve()]
+        mine = [frame for frame in frames if Path(frame.filename).resolve() == file]
         if not mine:
             raise
         said = " ".join(str(error).split()).partition(". ")[0]

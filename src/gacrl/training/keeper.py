@@ -1,5 +1,6 @@
 """What is kept of a run after every chunk, in the background: the whole state, and the best policy so far."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,7 @@ class Keeper:
     ):
         self._num_seeds, self._algorithm, self._writer, self._rows = num_seeds, algorithm, writer, rows
         self._save = partial(checkpoint.save, folder.checkpoints, fingerprint=fingerprint)
+        self._writing = partial(folder.writing, task.name)
         self._headline = task.headline
         self._sign = 1.0 if task.metric(task.headline).higher_is_better else -1.0
         self._best = self._kept_score(folder.checkpoints)
@@ -62,12 +64,20 @@ class Keeper:
             policy = checkpoint.serialise(checkpoint.arrays(Acting(self._algorithm.acting(state.learner))))
             kept = {self._headline: score}
             writes.append(partial(self._save, policy, env_steps, counters=kept, kind=checkpoint.BEST))
-        self._writer.submit(lambda: [write() for write in writes])
+        self._submit(writes)
 
     def begin(self, state: TrainState) -> None:
         """Keep a state before any training, for a run that does not begin with fresh parameters."""
         state = without_padding(state, self._num_seeds)
-        self._writer.submit(partial(self._save, self._serialised(state), 0, counters={ROWS: 0}))
+        self._submit([partial(self._save, self._serialised(state), 0, counters={ROWS: 0})])
+
+    def _submit(self, writes: Sequence[Callable[[], object]]) -> None:
+        def write() -> None:
+            with self._writing():
+                for one in writes:
+                    one()
+
+        self._writer.submit(write)
 
     def _serialised(self, state: TrainState) -> bytes:
         return checkpoint.serialise(checkpoint.arrays(state, self._algorithm.replay(state.learner)))

@@ -22,6 +22,7 @@ class RunFolder:
     `episodes/`."""
 
     def __init__(self, path: Path):
+        path = path.absolute()  # wherever the process goes later
         self.path = path
         self.config_file = path / "config.json"
         self.origin_file = path / "origin.json"
@@ -135,6 +136,24 @@ class RunFolder:
             yield
         finally:
             lock.release()
+
+    @contextmanager
+    def writing(self, task: str) -> Generator[None]:
+        """Raise UserError, with how to resume the run of this task, where one of its files cannot be written.
+
+        Nothing but writing belongs into it: an OSError of somebody else's code is not about this folder.
+        """
+        try:
+            yield
+        except OSError as error:
+            raise UserError(
+                f"cannot write to {self.path}: {reason(error)}; make room there or allow writing, "
+                f"then `{self.resumed_by(task)}` goes on from the last checkpoint"
+            ) from error
+
+    def resumed_by(self, task: str) -> str:
+        """Return the command that resumes this run of a task."""
+        return f"gacrl resume {self.path}{tasks.flag(task)}"
 
     def append_metrics(self, rows: list[dict[str, Any]]) -> None:
         """Add one line per row to `metrics.jsonl` and see it to the disk."""

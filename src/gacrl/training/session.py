@@ -1,6 +1,6 @@
 """A run from its settings to its summary: what the command line and `gacrl.train` both call."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from gacrl import render, tasks
 from gacrl.config import files as configuration
 from gacrl.config.checks import whole
 from gacrl.config.run import RunConfig
-from gacrl.errors import UserError, reason
+from gacrl.errors import UserError
 from gacrl.evaluation import episodes, references
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
@@ -23,7 +23,7 @@ from gacrl.training.build import evaluated_settings, make_trainer, member_shapes
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
-from gacrl.training.loop import Clock, train
+from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.watching import Watcher
@@ -65,6 +65,7 @@ def start(
 
     Raises UserError for a parent whose network does not fit.
     """
+    out = None if out is None else out.absolute()
     watcher, trainer = watcher or Watcher(), make_trainer(config)
     planned = plan(trainer, config)
     begun = None if parent is None else begin_with(trainer, config, parent)
@@ -171,52 +172,59 @@ def _run(
     begun: TrainState | None = None,
 ) -> Ended:
     """begun: the state to begin with, stacked, where it is not a fresh one."""
-    again = tasks.flag(config.task)
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
-    try:
+    with folder.writing(config.task):
         if leads():
             folder.diverged_file.unlink(missing_ok=True)
         rows = folder.forget_metrics_after(env_steps) if leads() else 0
-        if leads() and found is not None and rows != found.counters.get(ROWS, rows):
-            watcher.warn(
-                f"{folder.metrics_file} has {rows} of the {found.counters[ROWS]} lines that were written up to "
-                f"environment step {env_steps}: the others are lost, what follows is not"
-            )
-        with Writer() as writer:
-            task = tasks.find(config.task)
-            keep = Keeper(folder, config.num_seeds, trainer.algorithm, task, fingerprint, writer, rows)
-            if begun is not None and leads():
-                keep.begin(gathered(state))
-            for progress in train(trainer, config, state, env_steps, clock, watcher.compiling):
-                env_steps, state, clock = progress.env_steps, progress.state, progress.clock
-                if leads():
-                    writer.wait()  # one evaluation at most is ahead of its checkpoint
+    if leads() and found is not None and rows != found.counters.get(ROWS, rows):
+        watcher.warn(
+            f"{folder.metrics_file} has {rows} of the {found.counters[ROWS]} lines that were written up to "
+            f"environment step {env_steps}: the others are lost, what follows is not"
+        )
+    with Writer() as writer:
+        task = tasks.find(config.task)
+        keep = Keeper(folder, config.num_seeds, trainer.algorithm, task, fingerprint, writer, rows)
+        if begun is not None and leads():
+            keep.begin(gathered(state))
+        chunks = train(trainer, config, state, env_steps, clock, watcher.compiling)
+        for progress in _explained(chunks, folder, config.task, env_steps):
+            env_steps, state, clock = progress.env_steps, progress.state, progress.clock
+            if leads():
+                writer.wait()  # one evaluation at most is ahead of its checkpoint
+                with folder.writing(config.task):
                     folder.append_metrics(list(progress.rows))
-                    keep(progress)
-                watcher.progress(progress)
-                if anyone(watcher.stop()) and not progress.done:
-                    return Ended(folder.path, config, env_steps, None)
-        watcher.finishing()
-        summary = _finish(folder, config, trainer, state, env_steps, clock)
-        watcher.finished(summary)
+                keep(progress)
+            watcher.progress(progress)
+            if anyone(watcher.stop()) and not progress.done:
+                return Ended(folder.path, config, env_steps, None)
+    watcher.finishing()
+    summary = _finish(folder, config, trainer, state, env_steps, clock)
+    watcher.finished(summary)
+    return Ended(folder.path, config, env_steps, summary)
+
+
+def _explained(chunks: Iterator[Progress], folder: RunFolder, task: str, env_steps: int) -> Iterator[Progress]:
+    """Pass on the chunks of a training; where it cannot go on, add to the sentence how to resume it.
+
+    What the caller does between two chunks, its watcher among it, raises its own errors past this.
+    """
+    try:
+        for progress in chunks:
+            env_steps = progress.env_steps
+            yield progress
     except Diverged as error:
         if leads():
             folder.write_diverged(str(error).partition(";")[0])
         raise Diverged(
-            f"{error}, or see the first bad update with `gacrl resume {folder.path}{again} --diagnose`, which begins "
+            f"{error}, or see the first bad update with `{folder.resumed_by(task)} --diagnose`, which begins "
             f"at {'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
         ) from error
     except Faulty as error:
         raise Faulty(
-            f"{error}, then go on with `gacrl resume {folder.path}{again}` from environment step {env_steps}"
+            f"{error}, then go on with `{folder.resumed_by(task)}` from environment step {env_steps}"
         ) from error
-    except OSError as error:
-        raise UserError(
-            f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
-            f"then `gacrl resume {folder.path}{again}` goes on from the last checkpoint"
-        ) from error
-    return Ended(folder.path, config, env_steps, summary)
 
 
 def _clock(found: checkpoint.Checkpoint) -> Clock:
@@ -262,7 +270,8 @@ def _finish(
         "wall_seconds": clock.wall,
         "versions": versions(),
     }
-    folder.write_summary(summary)
+    with folder.writing(config.task):
+        folder.write_summary(summary)
     _show(folder, config, trainer, learner)
     return summary
 
@@ -280,12 +289,13 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
         trainer.intervention,
         look=references.look_of(task, evaluated_settings(config)),
     )
-    folder.episodes.mkdir(exist_ok=True)
-    for number, episode in enumerate(shown):
-        episode.save(folder.episodes / f"{number}.npz")
-    if shown and shown[0].scene is not None:
-        title = f"{config.preset}, seed {config.seed}"
-        render.gif(shown, folder.gif, title=title, words=task.words)
+    with folder.writing(config.task):
+        folder.episodes.mkdir(exist_ok=True)
+        for number, episode in enumerate(shown):
+            episode.save(folder.episodes / f"{number}.npz")
+        if shown and shown[0].scene is not None:
+            title = f"{config.preset}, seed {config.seed}"
+            render.gif(shown, folder.gif, title=title, words=task.words)
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:

@@ -144,6 +144,7 @@ def sweep(
     together: members trained side by side; by default three for each CPU core, or all of them on an accelerator.
     Raises UserError for a folder that holds something else.
     """
+    out = out.absolute()
     asked = {**asdict(grid), "choice": grid.choice._asdict(), "config": configuration.to_dict(grid.config)}
     claim_folder(out, _MARKER, asked, "sweep", lambda held: "a sweep of other settings: choose another --out")
     with RunFolder(out).locked():

@@ -117,6 +117,7 @@ def reproduce(
     that holds something else.
     """
     watch, seeds, episodes = watch or Watch(), whole(seeds, "seeds"), whole(episodes, "episodes")
+    out = out.absolute()
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if episodes < 1:
