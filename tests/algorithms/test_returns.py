@@ -1,13 +1,18 @@
 """Advantages and n-step returns: by hand, and as rlax has them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import rlax
 
+from gacrl import rollout
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
+from gacrl.evaluation.references import random
+from gacrl.tasks.spread.environment import Spread
 
 T = 12
+KEY = jax.random.key(1)
 
 
 def test_advantages_by_hand():
@@ -25,7 +30,6 @@ def test_advantages_by_hand():
     [
         ([3, 7], [3, 7, 9], [11, 12, 13, 103, 15, 16, 17, 107, 19, 109]),  # episodes of 4 steps, cut at the end
         ([], [9], [11, 12, 13, 14, 15, 16, 17, 18, 19, 109]),
-        ([0, 1, 2, 3, 4], [0, 1, 2, 3], [100, 101, 102, 103, 14, 16, 17, 18, 19, 19]),  # sooner than it says
     ],
 )
 def test_next_values_are_computed_where_they_are_not_known(
@@ -41,6 +45,32 @@ def test_next_values_are_computed_where_they_are_not_known(
     found = next_values(10.0 + jnp.arange(10.0)[:, None], truncated, 4, anew)
     assert sorted(set(rows[0])) == asked and len(rows[0]) == 4, "three time limits and the end fit ten steps"
     np.testing.assert_array_equal(found[:, 0], expected)
+
+
+def test_every_end_has_its_own_next_value_where_episodes_end_at_any_step():
+    """V(s_t) = t, and 1,000 + t for what follows step t: steps 0 to 4 are truncated, and so is the last."""
+    truncated = jnp.zeros(10, bool).at[jnp.arange(5)].set(True)
+    found = next_values(jnp.arange(10.0)[:, None], truncated, 1, lambda at: 1000.0 + at[:, None])
+    np.testing.assert_array_equal(found[:, 0], 1000.0 + np.arange(10))
+
+
+@pytest.mark.parametrize("collisions", ["truncate", "off"])
+def test_no_end_of_a_task_is_bootstrapped_with_the_value_of_its_own_step(collisions: str):
+    """25 steps of 64 copies of spread, played at random where agents often touch."""
+    env = Spread(reset_on_collision=collisions, reset_distance=0.3, arena_scale=0.5)
+    policy, memory = random(env)
+    start = rollout.start(env, env.default_params(), memory, jax.random.key(0), 64)
+    collect = jax.jit(lambda start: rollout.collect(env, policy, memory, env.default_params(), start, KEY, 25)[1])
+    truncated = collect(start).transitions.truncated
+    own = jnp.arange(25.0)[:, None]
+
+    def after(truncated: jax.Array) -> jax.Array:
+        return next_values(own, truncated, env.shortest_truncated, lambda at: 1000.0 + at[:, None])
+
+    found = np.asarray(jax.vmap(after, 1, 1)(truncated))[..., 0]
+    ends = np.asarray(truncated)
+    assert ends.sum() == 64 if collisions == "off" else ends.sum() > 128
+    np.testing.assert_array_equal(found[ends], 1000.0 + np.nonzero(ends)[0])
 
 
 def test_n_step_returns_by_hand():

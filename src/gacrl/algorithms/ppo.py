@@ -269,7 +269,7 @@ def targets(
             seen, before = jax.tree.map(lambda leaf: leaf[at], (steps.next_observation, memories))
             return learner.norm.denormalise(jax.vmap(lambda *end: critic(*end)[0])(seen, before))
 
-        return next_values(value, steps.truncated, p.env.max_cycles, anew)
+        return next_values(value, steps.truncated, p.env.shortest_truncated, anew)
 
     next_value = jax.vmap(after, (1, 0, 1), 1)(steps, memory.critic, value)
     reward = share_reward(steps.reward, steps.observation.agent_mask, p.config.reward == "team")

@@ -326,7 +326,7 @@ def following(
         ends = jax.tree.map(lambda leaf: leaf[at], (seen.next_observation, *memories))
         return jax.vmap(lambda *end: bootstrap(q, pair, *end))(*ends)
 
-    return next_values(value, seen.truncated, q.env.max_cycles, anew)
+    return next_values(value, seen.truncated, q.env.shortest_truncated, anew)
 
 
 def window_loss(

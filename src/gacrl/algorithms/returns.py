@@ -12,18 +12,21 @@ from jaxtyping import Array, Bool, Float, Int
 def next_values(
     value: Float[Array, "T *b"],
     truncated: Bool[Array, " T"],
-    max_cycles: int,
+    shortest: int,
     anew: Callable[[Int[Array, " K"]], Float[Array, "K *b"]],
 ) -> Float[Array, "T *b"]:
     """The value of what followed each of T steps of one environment, from the value of each step's own observation.
 
-    What followed is the next step's, and known, but at a time limit, after which that is a new episode's, and at the
-    end: only there `anew` computes it, given the steps. Room is made for as many as episodes of `max_cycles` steps
-    allow; at a time limit beyond them the step's own value stands in. After `terminated` it means nothing.
+    What followed is the next step's, and known, except where an episode was truncated, after which that is a new
+    episode's, and at the end: only there `anew` computes it, given the steps. Room is made for as many truncations as
+    there can be, `shortest` steps apart; where any step may be one, all values are computed. After `terminated` the
+    value means nothing.
     """
     steps = truncated.shape[0]
+    if shortest == 1:
+        return anew(jnp.arange(steps))
     broken = truncated.at[-1].set(True)
-    at = jnp.nonzero(broken, size=min(-(-steps // max_cycles) + 1, steps), fill_value=steps - 1)[0]
+    at = jnp.nonzero(broken, size=min(-(-steps // shortest) + 1, steps), fill_value=steps - 1)[0]
     stand_in = jnp.where(broken.reshape(-1, *[1] * (value.ndim - 1)), value, jnp.roll(value, -1, axis=0))
     return stand_in.at[at].set(anew(at))
 

@@ -51,6 +51,9 @@ class Environment(ABC):
     """Actions are [N, A] numbers in [0, 1] instead of [N] indices."""
     num_symmetries: int = 1
     """Rotations and reflections under which the task is the same; 0 is the identity."""
+    shortest_truncated: int = 1
+    """No episode is truncated before so many steps. Where only the time limit truncates, `max_cycles` says so, and
+    learners bootstrap at fewer steps; 1 is right for every task."""
     observes_state: ClassVar[bool] = False
     """Whether `observe_many` makes observations from states, which is then cheaper than to hand them through."""
 

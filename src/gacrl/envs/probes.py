@@ -49,6 +49,7 @@ class Probe(Environment):
     observation_size: int = 2
     max_cycles: int = 2
     continuous_actions: bool = False
+    shortest_truncated: int = 2
 
     def default_params(self) -> ProbeParams:
         return ProbeParams(jnp.asarray(PROBES.index(self.probe)))

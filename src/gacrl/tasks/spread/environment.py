@@ -120,6 +120,10 @@ class Spread(SpreadSettings, Environment):
         """Velocity, position, landmarks, other agents, their silent channel of two numbers each."""
         return 4 + 2 * self.seen_landmarks + 4 * self.seen_agents
 
+    @property
+    def shortest_truncated(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 1 if self.reset_on_collision == "truncate" else self.max_cycles
+
     def default_params(self) -> SpreadParams:
         """The numbers of the settings; γ is 1, and nobody is absent."""
         return params_of(self)
