@@ -13,7 +13,7 @@ from gacrl import play, tasks
 from gacrl.config import files as configuration
 from gacrl.config.checks import whole
 from gacrl.config.run import RunConfig
-from gacrl.envs.environment import Environment
+from gacrl.envs.environment import Environment, typed_keys
 from gacrl.errors import ConfigError
 from gacrl.evaluation import evaluate as playing
 from gacrl.evaluation.summary import Estimate, estimated
@@ -178,7 +178,10 @@ def trainer(
             built.metrics,
         )
 
-    return Trainer(lambda key: built.init_member(key, built.algorithm.hyper), built.chunk_of_one, evaluate)
+    def init(key: PRNGKey) -> TrainState:
+        return built.init_member(typed_keys(key), built.algorithm.hyper)
+
+    return Trainer(init, built.chunk_of_one, evaluate)
 
 
 def make_env(name: Any = tasks.DEFAULT, **settings: Any) -> Environment:

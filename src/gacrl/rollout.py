@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
 from gacrl.envs import copies
-from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
+from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep, typed_keys
 from gacrl.errors import ConfigError
 from gacrl.networks.memory import restarted
 from gacrl.types import (
@@ -50,6 +50,7 @@ def start(
 
     An intervention needs the policy whose words it catches. Raises ConfigError where that says nothing.
     """
+    key = typed_keys(key)
     env_state, observation = copies.reset(env, params, jax.random.split(key, num_envs))
     memories = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_envs, *leaf.shape)), memory)
     carry = Carry(env_state, observation, memories, jnp.ones(num_envs, bool))
@@ -148,7 +149,7 @@ def step(
     intervention: Intervention | None = None,
 ) -> tuple[Carry, Transition]:
     """Let every environment take one step; those whose episode ended are reset, with fresh memory."""
-    keys = jax.random.split(key, (carry.first.shape[0], 3))
+    keys = jax.random.split(typed_keys(key), (carry.first.shape[0], 3))
     after, transition = act(env, policy, params, carry, keys, intervention)
     return renew(env, initial_memory, params, after, transition.left, keys), transition
 

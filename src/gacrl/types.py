@@ -9,9 +9,10 @@ A container is written for one environment at one step; `rollout` puts [T, E] in
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-PRNGKey: TypeAlias = Key[Array, ""]
+PRNGKey: TypeAlias = Key[Array, ""] | UInt32[Array, "_"]
+"""A key of `jax.random.key`, or the numbers of one, as `jax.random.PRNGKey` makes them (`environment.typed_keys`)."""
 Memory: TypeAlias = Any
 """A pytree that a policy carries from step to step: `()` when feed-forward, a recurrent carry otherwise.
 

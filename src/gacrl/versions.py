@@ -1,9 +1,13 @@
 """Which versions of what is running. A leaf: it imports no jax."""
 
+import os
 import platform
 import subprocess
+import tomllib
 from importlib import metadata
 from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
 
 
 def version(package: str = "gacrl") -> str:
@@ -15,13 +19,35 @@ def version(package: str = "gacrl") -> str:
 
 
 def versions() -> dict[str, str]:
-    """What produced a run: packages, Python, and the commit where the source is a git checkout."""
+    """What produced a run: packages, Python, and the commit where the source is a checkout of our own repository."""
     packages = ("gacrl", "jax", "jaxlib", "equinox", "optax", "numpy", "mpe2")
-    found = {name: version(name) for name in packages}
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    commit = git_commit(_PACKAGE)
+    return {
+        **{name: version(name) for name in packages},
+        "python": platform.python_version(),
+        **({} if commit is None else {"git_commit": commit}),
+    }
+
+
+def git_commit(package: Path) -> str | None:
+    """The commit of our own repository, whose `src` holds this package; None where another one surrounds it, or none.
+
+    A virtual environment may lie in its user's repository, and a hook of theirs may name that in GIT_DIR.
+    """
+    root = package.parent.parent
+    if package.parent.name != "src" or not (root / ".git").exists() or not _is_ours(root / "pyproject.toml"):
+        return None
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    git = ["git", "-C", str(root), "rev-parse", "HEAD"]
     try:
-        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
+        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False, env=environment)
     except (OSError, subprocess.TimeoutExpired):
-        return {**found, "python": platform.python_version()}
-    commit = {"git_commit": done.stdout.strip()} if done.returncode == 0 else {}
-    return {**found, "python": platform.python_version(), **commit}
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _is_ours(project: Path) -> bool:
+    try:
+        return tomllib.loads(project.read_text(encoding="utf-8"))["project"]["name"] == "gacrl"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -1,14 +1,19 @@
 """Many copies at once: the numbers of each by itself, whatever ends the episodes."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gacrl import rollout
 from gacrl.envs import copies
 from gacrl.envs.probes import Probe
+from gacrl.evaluation.episodes import record_many
+from gacrl.evaluation.evaluate import evaluate
+from gacrl.evaluation.references import random
 from gacrl.tasks.spread.environment import Spread
 
 pytestmark = pytest.mark.usefixtures("quick_start")
@@ -81,3 +86,28 @@ def test_a_task_that_knows_no_quicker_way_is_mapped():
         state, seen, after = step(state, key)
         assert after.reward.shape == (E, env.num_agents)
         assert seen.features.shape == first.features.shape
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("kind", [jnp.asarray, np.asarray])
+def test_keys_that_are_numbers_draw_what_keys_draw(kind: Any):
+    """What `jax.random.PRNGKey` makes is an array of two numbers, and no two copies of anything."""
+    env = Spread(3, 2, reset_on_collision="in_place", reset_distance=5.0)
+    params, (policy, memory) = env.default_params(), random(env)
+
+    def drawn(key: Any) -> Any:
+        state, seen = env.reset(key)
+        keys = jax.random.split(key, E)
+        states, _ = jax.vmap(env.reset)(keys)
+        carry = rollout.start(env, params, memory, key, E)
+        return (
+            (seen, env.step(state, jnp.zeros(3, int), key), env.step_many(states, jnp.zeros((E, 3), int), keys)),
+            rollout.collect(env, policy, memory, params, carry, key, 3),
+            record_many(env, policy, memory, params, key, 1)[0].reward,
+            evaluate(env, policy, memory, params, key, 2),
+        )
+
+    found, expected = drawn(kind(jax.random.PRNGKey(0))), drawn(jax.random.key(0))
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -9,17 +9,17 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Bool, Key, UInt32
 
-from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
+from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep, typed_keys
 from gacrl.types import Observation, PRNGKey
 
-Keys: TypeAlias = Key[Array, " E"]
+Keys: TypeAlias = Key[Array, " E"] | UInt32[Array, "E _"]
 
 
 def reset(env: Environment, params: EnvParams, keys: Keys) -> tuple[EnvState, Observation]:
     """E fresh episodes."""
-    return jax.vmap(env.reset, (0, None))(keys, params)
+    return jax.vmap(env.reset, (0, None))(typed_keys(keys), params)
 
 
 def step(
@@ -29,7 +29,7 @@ def step(
 
     Where an episode has ended the first two are those of a new one; the third holds the last observation of the old.
     """
-    num_envs = action.shape[0]
+    key, num_envs = typed_keys(key), action.shape[0]
     state, after = env.step_many(state, action, jax.random.split(key, num_envs), params)
 
     def reset_keys() -> Keys:

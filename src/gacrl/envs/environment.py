@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from gacrl.config.checks import require
 from gacrl.types import Entities, Metrics, Observation, PRNGKey
@@ -121,7 +121,11 @@ class Environment(ABC):
         return action
 
     def step_many(
-        self, state: EnvState, action: Array, keys: Key[Array, " E"], params: EnvParams = ()
+        self,
+        state: EnvState,
+        action: Array,
+        keys: Key[Array, " E"] | UInt32[Array, "E _"],
+        params: EnvParams = (),
     ) -> tuple[EnvState, TimeStep]:
         """Step E copies. A task may know a quicker way than to map its step."""
         return jax.vmap(self.step, (0, 0, 0, None))(state, action, keys, params)
@@ -129,6 +133,11 @@ class Environment(ABC):
     def observe_many(self, state: EnvState, params: EnvParams = ()) -> Observation:
         """What is seen in each of E states, for a task that `observes_state`."""
         raise NotImplementedError
+
+
+def typed_keys(keys: Array) -> Key[Array, "..."]:
+    """Return keys as JAX's key arrays, whose shape is that of the copies; those of `jax.random.PRNGKey` are wrapped."""
+    return keys if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(keys)
 
 
 def observe(

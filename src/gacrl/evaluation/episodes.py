@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl import rollout
-from gacrl.envs.environment import Environment, EnvParams, EnvState
+from gacrl.envs.environment import Environment, EnvParams, EnvState, typed_keys
 from gacrl.scene import Discs, Scene, compose, discs
 from gacrl.types import Intervention, Memory, Observation, Policy, PRNGKey, Transition
 
@@ -222,7 +222,7 @@ def record_many(
             agent_mask=steps.observation.agent_mask,
         )
 
-    played = jax.device_get(play(initial_memory, params, key))
+    played = jax.device_get(play(initial_memory, params, typed_keys(key)))
 
     def one(k: int) -> Episode:
         steps = int(played.done[:, k].argmax()) + 1  # the time limit ends what nothing else has ended

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped, UInt32
 
-from gacrl.envs.environment import Environment, TimeStep
+from gacrl.envs.environment import Environment, TimeStep, typed_keys
 from gacrl.envs.particles import (
     DIRECTIONS,
     Physics,
@@ -131,11 +131,15 @@ class Spread(SpreadSettings, Environment):
     def reset(self, key: PRNGKey, params: SpreadParams | None = None) -> tuple[SpreadState, Observation]:
         """Agents and landmarks uniform in the arena, agents at rest."""
         params = self.default_params() if params is None else params
-        state = self._place(key, params)
+        state = self._place(typed_keys(key), params)
         return state, self.observe(state, params)
 
     def step_many(
-        self, state: SpreadState, action: Array, keys: Key[Array, " E"], params: SpreadParams | None = None
+        self,
+        state: SpreadState,
+        action: Array,
+        keys: Key[Array, " E"] | UInt32[Array, "E _"],
+        params: SpreadParams | None = None,
     ) -> tuple[SpreadState, TimeStep]:
         """What `step` is for each of E copies [E, …], to rounding; several times as fast as mapping it."""
         last_state, last_action = _copies_last((state, action))
@@ -147,7 +151,11 @@ class Spread(SpreadSettings, Environment):
         return _copies_first(self.observe(_copies_last(state), params))
 
     def step(
-        self, state: SpreadState, action: Array, key: Key[Array, "*e"], params: SpreadParams | None = None
+        self,
+        state: SpreadState,
+        action: Array,
+        key: Key[Array, "*e"] | UInt32[Array, "*e _"],
+        params: SpreadParams | None = None,
     ) -> tuple[SpreadState, TimeStep]:
         """One step of the world. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
         params = self.default_params() if params is None else params
@@ -171,7 +179,7 @@ class Spread(SpreadSettings, Environment):
             if self.reset_on_collision == "truncate":
                 truncated |= collided
             else:
-                fresh = self._place(key, params)._replace(clock=state.clock)
+                fresh = self._place(typed_keys(key), params)._replace(clock=state.clock)
                 state = jax.tree.map(
                     lambda new, old: jnp.where(jnp.broadcast_to(collided, old.shape), new, old), fresh, state
                 )
