@@ -1,6 +1,7 @@
 """Pictures: everything is in them, where and in the colour that it should be, for any size of team."""
 
 import itertools
+import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -131,6 +132,50 @@ def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_pat
             assert (error > 0).mean() < 0.15
             assert error.max() < 90
     assert durations == [600, 50, 50, 1500, 600, 50, 50, 50, 50, 1500]
+
+
+def test_a_long_episode_is_thinned_and_no_more_than_a_frame_is_kept(tmp_path, monkeypatch):
+    """41 moments in 9 frames, five apart; and 3 in 3. Each is on the disk before the next is drawn."""
+    monkeypatch.setattr(render, "MOST_FRAMES", 9)
+    kept, written, add = [], [], render._Film.add
+
+    def watched(film, frame, pause) -> None:
+        kept.append(weakref.ref(frame))
+        add(film, frame, pause)
+        assert sum(frame() is not None for frame in kept) <= 2, "this one and the one before"
+        written.append(film._file.tell())
+
+    monkeypatch.setattr(render._Film, "add", watched)
+    long, path = walk(0, steps=40), tmp_path / "long.gif"
+    render.gif([long, walk(1, steps=2)], path, size=240, fps=20, title="Long", words=SPREAD)
+    assert len(written) == 12 and (np.diff(written) > 0).all()
+    assert (render.num_frames(40), render.num_frames(2)) == (9, 3)
+    with Image.open(path) as film:
+        assert film.n_frames == 12
+        durations = []
+        for k in range(12):
+            film.seek(k)
+            durations.append(film.info["duration"])
+            if k < 9:
+                expected = np.asarray(render.frame(long, 5 * k, 240, "Long", SPREAD))[20:]
+                error = np.abs(np.asarray(film.convert("RGB"))[20:].astype(int) - expected).max(-1)
+                assert (error > 0).mean() < 0.15 and error.max() < 90
+    assert durations == [600, *[50] * 7, 1500, 600, 50, 1500]
+
+
+def test_a_frame_in_which_nothing_changes_has_its_time(tmp_path):
+    path, still = tmp_path / "still.gif", np.zeros((4, 5), np.uint8)
+    with path.open("wb") as file:
+        film = render._Film(file, [10, 20, 30, 200, 100, 50])
+        for pause in (600, 50, 1500):
+            film.add(still, pause)
+        film.end()
+    with Image.open(path) as film:
+        assert film.n_frames == 3
+        for k, pause in enumerate((600, 50, 1500)):
+            film.seek(k)
+            assert film.info["duration"] == pause
+            assert (np.asarray(film.convert("RGB")) == [10, 20, 30]).all()
 
 
 def test_four_usual_episodes_make_a_small_file(tmp_path):

@@ -7,15 +7,17 @@ by colour alone.
 
 import functools
 import math
+import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, SupportsIndex, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from jaxtyping import Float, UInt8
+from PIL import GifImagePlugin, Image, ImageColor, ImageDraw, ImageFont
 
+from gacrl.config.checks import typed, whole
 from gacrl.evaluation.episodes import Episode, written_whole
 from gacrl.scene import PLAIN, Scene
 from gacrl.tasks.task import Words
@@ -50,6 +52,8 @@ _SAMPLES = 8
 """Frames that a GIF's palette is made from."""
 _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 """How long an episode's first and last frame stay."""
+MOST_FRAMES = 200
+"""Of an episode: of a longer one so many moments are shown, evenly spread."""
 
 _Point: TypeAlias = tuple[float, float]
 WORDS = Words()
@@ -58,48 +62,103 @@ WORDS = Words()
 def gif(
     episodes: Sequence[Episode],
     path: Path,
-    size: int = 480,
+    size: SupportsIndex = 480,
     fps: int | float = 10,
     title: str = "",
     words: Words = WORDS,
 ) -> None:
     """Write the episodes, one after the other, as an animated GIF that is `size` pixels wide.
 
-    words: what the task calls the things in it. Raises OSError where the file cannot be written, ValueError without
-    episodes, for one without a scene, or for an impossible size or speed.
+    An episode of more than `MOST_FRAMES` moments is thinned to so many. One frame at a time is in memory. words: what
+    the task calls the things in it. Raises OSError where the file cannot be written, ValueError without episodes, for
+    one without a scene, or for an impossible size or speed.
+    """
+    pixels = whole(size, "size")
+    pauses = durations(episodes, fps)
+    with written_whole(path) as file:
+        palette = _palette(drawn(episodes, pixels, title, words, -(-len(pauses) // _SAMPLES)))
+        film = _Film(file, palette.getpalette() or [])
+        for picture, pause in zip(drawn(episodes, pixels, title, words), pauses, strict=True):
+            film.add(np.asarray(picture.quantize(palette=palette, dither=Image.Dither.NONE)), pause)
+        film.end()
+
+
+def drawn(
+    episodes: Sequence[Episode], size: int, title: str = "", words: Words = WORDS, step: int = 1
+) -> Iterator[Image.Image]:
+    """Draw every `step`-th frame of the episodes, one after the other."""
+    number = 0
+    for k, episode in enumerate(episodes, 1):
+        note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
+        picture = _Picture(episode, size, title, note, words)
+        for t in _moments(episode.num_steps):
+            if number % step == 0:
+                yield picture.draw(t)
+            number += 1
+
+
+def durations(episodes: Sequence[Episode], fps: int | float) -> list[int]:
+    """Return for how many milliseconds each frame of the episodes is seen.
+
+    Raises ValueError without episodes, or for an impossible speed.
     """
     if not episodes:
-        raise ValueError("a GIF needs at least one episode")
-    if not 0 < fps <= 50:
+        raise ValueError("a picture needs at least one episode")
+    speed = typed(fps, float, "fps")
+    if not 0 < speed <= 50:
         raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
-    every = -(-sum(episode.num_steps + 1 for episode in episodes) // _SAMPLES)
+    return [pause for episode in episodes for pause in _durations(num_frames(episode.num_steps), speed)]
 
-    def drawn(step: int = 1) -> Iterator[Image.Image]:
-        """Every `step`-th frame of all episodes."""
-        moment = 0
-        for k, episode in enumerate(episodes, 1):
-            note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
-            picture = _Picture(episode, size, title, note, words)
-            for t in range(episode.num_steps + 1):
-                if moment % step == 0:
-                    yield picture.draw(t)
-                moment += 1
 
-    with written_whole(path) as file:
-        palette = _palette(drawn(every))
-        frames = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn())
-        colours = palette.getpalette() or []
-        next(frames).save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=frames,
-            duration=[pause for episode in episodes for pause in _durations(episode.num_steps, fps)],
-            loop=0,
-            palette=bytes([*colours, 0, 0, 0]),
-            transparency=len(colours) // 3,  # a pixel that stays as it was
-            optimize=True,
+def num_frames(num_steps: int) -> int:
+    """How many frames a picture has of an episode of so many steps."""
+    return min(num_steps + 1, MOST_FRAMES)
+
+
+def _moments(num_steps: int) -> list[int]:
+    """Before which steps the frames are; the first and the last moment are always among them."""
+    return [round(moment) for moment in np.linspace(0, num_steps, num_frames(num_steps)).tolist()]
+
+
+class _Film:
+    """A GIF (version 89a) that is written frame by frame; no frame is kept but the one before.
+
+    Pillow keeps all of them until it writes the first.
+    """
+
+    def __init__(self, file: BinaryIO, colours: Sequence[int]) -> None:
+        """colours: at most 255, red, green and blue one after the other."""
+        self._file = file
+        self._unchanged = len(colours) // 3
+        """The colour of a pixel that stays as it was."""
+        self._colours = bytes(colours).ljust(3 * 256, b"\0")
+        self._before: UInt8[np.ndarray, "height width"] | None = None
+
+    def add(self, frame: UInt8[np.ndarray, "height width"], pause: int) -> None:
+        """Write a frame that stays for so many milliseconds: where it differs from the one before."""
+        if self._before is None:
+            self._begin(*frame.shape)
+            changed = np.ones_like(frame, bool)
+        else:
+            changed = frame != self._before
+            changed[0, 0] |= not changed.any()  # also a frame in which nothing moves has its time
+        rows, columns = np.flatnonzero(changed.any(1)), np.flatnonzero(changed.any(0))
+        part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        image = Image.fromarray(np.where(changed, frame, np.uint8(self._unchanged))[part])
+        blocks = GifImagePlugin.getdata(
+            image, (int(columns[0]), int(rows[0])), duration=pause, disposal=1, transparency=self._unchanged
         )
+        self._file.writelines(blocks)
+        self._before = frame
+
+    def end(self) -> None:
+        """Write what closes the file."""
+        self._file.write(b";")
+
+    def _begin(self, height: int, width: int) -> None:
+        """Write the size, one table of 256 colours for all frames, and that they are shown again and again."""
+        self._file.write(struct.pack("<6sHHBBB", b"GIF89a", width, height, 0b1111_0111, 0, 0) + self._colours)
+        self._file.write(b"!\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00")
 
 
 def frame(episode: Episode, t: int, size: int = 480, title: str = "", words: Words = WORDS) -> Image.Image:
@@ -109,11 +168,11 @@ def frame(episode: Episode, t: int, size: int = 480, title: str = "", words: Wor
     return _Picture(episode, size, title, "", words).draw(t)
 
 
-def _durations(num_steps: int, fps: int | float) -> list[int]:
+def _durations(frames: int, fps: float) -> list[int]:
     """Milliseconds of each frame of an episode; GIF counts in hundredths of a second."""
     usual = round(100 / fps) * 10
     first, last = (max(usual, round(seconds * 1000)) for seconds in (_FIRST_SECONDS, _LAST_SECONDS))
-    return [first, *[usual] * (num_steps - 1), last]
+    return [first, *[usual] * (frames - 2), last]
 
 
 def _palette(samples: Iterable[Image.Image]) -> Image.Image:
