@@ -2,6 +2,7 @@
 
 import functools
 import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -128,3 +129,20 @@ def test_numbers_of_numpy_are_numbers(config: RunConfig, tmp_path: Path):
     with pytest.raises(ConfigError, match=r"^extend must be at least 1, not 0$"):
         session.resume(run.folder, 0)
     assert not (tmp_path / "other").exists()
+
+
+def test_the_seconds_of_a_run_count_the_closing_evaluation_and_the_pictures(
+    config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The summary comes last: where it is, the pictures are as well."""
+    seconds: list[float] = []
+
+    def gif(*_: Any, **__: Any) -> None:
+        assert not (tmp_path / "run" / "summary.json").exists()
+        time.sleep(0.5)
+
+    monkeypatch.setattr(session.render, "gif", gif)
+    watcher = Watcher(progress=lambda progress: seconds.append(progress.clock.wall))
+    run = session.start(config, tmp_path / "run", watcher)
+    assert run.summary is not None
+    assert run.summary["wall_seconds"] > seconds[-1] + 0.5

@@ -16,6 +16,9 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.versions import version
 
+SHOWN_EPISODES = 4
+"""Episodes that a run keeps, and shows in its GIF."""
+
 
 class RunFolder:
     """One run: `config.json`, `origin.json`, `metrics.jsonl`, `summary.json` or `diverged.json`, `checkpoints/` and

@@ -1,5 +1,6 @@
 """A run from its settings to its summary: what the command line and `gacrl.train` both call."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -24,15 +25,12 @@ from gacrl.training.devices import anyone, gathered, leads, one_seed, same_every
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
-from gacrl.training.recorder import RunFolder
+from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
 from gacrl.versions import versions
-
-SHOWN_EPISODES = 4
-"""Episodes that a run keeps, and shows in its GIF."""
 
 
 @dataclass(frozen=True)
@@ -236,8 +234,8 @@ def _clock(found: checkpoint.Checkpoint) -> Clock:
 def _finish(
     folder: RunFolder, config: RunConfig, trainer: Trainer, state: TrainState, env_steps: int, clock: Clock
 ) -> dict[str, Any]:
-    """The closing evaluation, some episodes to look at, and the summary."""
-    num_episodes = config.evaluation.final_episodes
+    """The closing evaluation, some episodes to look at, and last the summary, which makes the run a finished one."""
+    begun, num_episodes = time.perf_counter(), config.evaluation.final_episodes
     task, settings = tasks.find(config.task), evaluated_settings(config)
     final = {
         kind: jax.device_get(gathered(trainer.evaluate(state.learner, kind == "sampled", "report", num_episodes)))
@@ -251,6 +249,7 @@ def _finish(
         task.facts(settings, trainer.table.names),
     )
     members = len(config.seeds)
+    _show(folder, config, trainer, learner)
     summary = {
         "preset": config.preset,
         "task": facts,
@@ -267,12 +266,11 @@ def _finish(
         "horizon": int(trainer.evaluation_env.max_cycles),
         "steps_per_second": clock.steps_per_second,
         "compile_seconds": clock.compiling,
-        "wall_seconds": clock.wall,
+        "wall_seconds": clock.wall + time.perf_counter() - begun,
         "versions": versions(),
     }
     with folder.writing(config.task):
         folder.write_summary(summary)
-    _show(folder, config, trainer, learner)
     return summary
 
 
