@@ -1,5 +1,10 @@
 """What a user can mend: one sentence that names the thing and the mend, exit code 2, no traceback."""
 
+import re
+
+_FULL = re.compile(r"out of memory[^\n]*|bad_alloc|RESOURCE_EXHAUSTED: ?([^\n]*)", re.IGNORECASE)
+"""What JAX, XLA's CPU and GPU runtimes and C++ say of a memory that is full."""
+
 
 class UserError(Exception):
     """Something the user asked for cannot be done."""
@@ -8,6 +13,14 @@ class UserError(Exception):
 def reason(error: OSError) -> str:
     """The operating system's words for what went wrong, without numbers and tracebacks."""
     return error.strerror or str(error)
+
+
+def full_memory(error: BaseException) -> str | None:
+    """The words of an error that is about a full memory; None for any other error."""
+    if isinstance(error, MemoryError):
+        return str(error).rstrip(" .") or "out of memory"
+    found = _FULL.search(str(error)) if isinstance(error, RuntimeError) else None
+    return None if found is None else (found[1] or found[0]).rstrip(" .")
 
 
 class ConfigError(UserError, ValueError):

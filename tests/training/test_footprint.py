@@ -22,6 +22,7 @@ pytestmark = pytest.mark.usefixtures("quick_start")
         "--preset ippo --algorithm.network.width 65536 --algorithm.network.depth 9",
         "--preset mappo --env.num-agents 10000",
         "--preset qmix --evaluation.final-episodes 100000 --env.num-agents 500",
+        "--preset ippo --env.num-agents 100 --env.max-cycles 1000000",  # the episodes that are kept to look at
     ],
 )
 def test_what_cannot_fit_is_refused_with_the_number(
@@ -39,6 +40,52 @@ def test_what_cannot_fit_is_refused_with_the_number(
     assert not out.exists()
     grown = (int(Path("/proc/self/statm").read_text().split()[1]) - before) * resource.getpagesize()
     assert grown < 2**30, "nothing large was allocated to find out"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "evaluate oracle --num-agents 3000 --horizon 2",
+        "evaluate pretrained:gacrl-teams --num-agents 1000 --episodes 2000",
+        "render random --num-agents 2000 --horizon 1000",
+    ],
+)
+def test_episodes_that_cannot_fit_are_not_played(
+    words: str, said: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(footprint, "memory_of", lambda device: 16 * 2**30)
+    monkeypatch.chdir(tmp_path)
+    code, sentence = said(*words.split())
+    assert code == 2
+    assert sentence.startswith("gacrl: to play these episodes takes at least ")
+    assert float(sentence.split("at least ")[1].split(" GiB")[0].replace(",", "")) > 16
+    assert "and cpu:0 has 16.0 GiB: take fewer or shorter episodes" in sentence
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_process_has_no_more_memory_than_its_limits_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Those of a cluster's job, of the slice around it, and of a container, in both versions of control groups."""
+    device, machine = jax.devices()[0], footprint.memory_of(jax.devices()[0])
+    job = tmp_path / "new" / "slurm" / "job_1" / "step_0"
+    job.mkdir(parents=True)
+    (job / "memory.max").write_text("max\n")
+    (job.parent / "memory.max").write_text("3000000000\n")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "memory.limit_in_bytes").write_text("9223372036854771712\n")
+    (tmp_path / "cgroup").write_text("4:cpu,memory:/elsewhere\n0::/slurm/job_1/step_0\n")
+    monkeypatch.setattr(footprint, "_OWN_CGROUPS", tmp_path / "cgroup")
+    new, old = (
+        (str(tmp_path / "new"), "", "memory.max"),
+        (str(tmp_path / "old"), "memory", "memory.limit_in_bytes"),
+    )
+    monkeypatch.setattr(footprint, "_CGROUPS", (new, old))
+    assert footprint.memory_of(device) == 3_000_000_000
+    (tmp_path / "old" / "memory.limit_in_bytes").write_text("2000000000\n")
+    assert footprint.memory_of(device) == 2_000_000_000
+    monkeypatch.setattr(footprint, "_CGROUPS", ())
+    assert machine is not None and machine <= footprint.memory_of(device)
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (10**9, resource.RLIM_INFINITY))
+    assert footprint.memory_of(device) == 10**9, "ulimit -v"
 
 
 def test_the_plan_of_a_run_counts_its_replay():

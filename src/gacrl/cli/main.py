@@ -17,7 +17,7 @@ from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
-from gacrl.errors import UserError, reason
+from gacrl.errors import UserError, full_memory, reason
 
 if TYPE_CHECKING:
     from gacrl.cli.arguments import Cluster, Evaluate, Render, Resume, Sweep
@@ -80,13 +80,13 @@ def main(words: Sequence[str] | None = None) -> int:
         name = f" {error.filename}" if error.filename else ""
         print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
         return 2
-    except RuntimeError as error:  # JAX's own; its class would have to be imported
-        if "RESOURCE_EXHAUSTED" not in str(error):
+    except (MemoryError, RuntimeError) as error:  # JAX's own is one; its class would have to be imported
+        said = full_memory(error)
+        if said is None:
             raise
-        said = str(error).partition("\n")[0].partition(": ")[2].rstrip(" .")
         print(
-            f"gacrl: the device's memory is full ({said}): take fewer seeds, environments or agents, or end what else "
-            "is using it",
+            f"gacrl: the device's memory is full ({said}): take fewer seeds, environments, episodes or agents, or end "
+            "what else is using it",
             file=sys.stderr,
         )
         return 2

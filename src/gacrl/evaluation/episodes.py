@@ -171,6 +171,21 @@ def written_whole(path: Path) -> Generator[BinaryIO]:
         unfinished.unlink(missing_ok=True)
 
 
+def recorded_bytes(env: Environment, params: EnvParams, num_episodes: int, look: Look | None = None) -> int:
+    """Memory that recorded episodes take at the least: what is seen and earned in every step up to the time limit.
+
+    Counted from shapes: nothing is played.
+    """
+    state, seen = jax.eval_shape(env.reset, jax.random.key(0), params)
+    scene = None if look is None else jax.eval_shape(look, state, params)
+    places = seen.positions if scene is None else scene
+    shown = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves((places, seen.agent_mask)))
+    agents, single = env.num_agents, np.dtype(np.float32).itemsize
+    acted = single * agents * (env.num_actions if env.continuous_actions else 1)
+    heard = agents**2  # who hears whom, a byte for each pair
+    return int(env.max_cycles) * num_episodes * (shown + acted + heard + single * agents)
+
+
 def record_many(
     env: Environment,
     policy: Policy,

@@ -19,6 +19,7 @@ from gacrl.messages.bits import bits_used
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun, open_run
 from gacrl.tasks.task import Task
+from gacrl.training import footprint
 from gacrl.types import Intervention, Memory, Policy
 
 Warn = Callable[[str], None]
@@ -68,12 +69,14 @@ def score_run(
     if scripted is not None:
         _require_words(run, intervention)
         played = scripted
+        _require_room(played, episodes)
         beside = _references(played, episodes, backend)
         metrics = beside.get(run) or _play_scripted(run, played, episodes, backend)
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
         opened = open_run(run, change, warn, intervention)
         played = Played(opened.task, opened.config.env)
+        _require_room(played, episodes, opened.trainer.memory)
         beside = _references(played, episodes, backend)
         final = {
             kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
@@ -110,15 +113,24 @@ def play(
     scripted = _scripted_task(run, tasks.DEFAULT if task is None else task, change)
     if scripted is not None:
         _require_words(run, intervention)
+        _require_room(scripted, episodes)
         metrics = references.scripted_episodes(run, scripted.task.name, scripted.settings, episodes)
         return {name: np.asarray(values)[None] for name, values in metrics.items()}
     opened = open_run(run, change, intervention=intervention)
+    _require_room(Played(opened.task, opened.config.env), episodes, opened.trainer.memory)
     metrics = jax.device_get(opened.trainer.evaluate(opened.learners, sampled, "report", episodes))
     return {name: values[: opened.config.num_seeds] for name, values in metrics.items()}
 
 
 def _require_words(scripted: str, intervention: Intervention | None) -> None:
     require(intervention is None, f"{scripted} says nothing: there are no messages to intervene in")
+
+
+def _require_room(played: Played, episodes: int, memory: Memory = ()) -> None:
+    """Raises UserError for more, or larger, episodes than this machine has the memory to play side by side."""
+    env = played.env
+    params = played.task.numbers(played.settings, env)
+    footprint.require_room_to_play(footprint.playing_bytes(env, params, memory, episodes))
 
 
 def _scripted_task(run: str, task: str, change: Change) -> Played | None:
@@ -179,6 +191,8 @@ def record_run(
         policy, memory, env = opened.policy(0, sampled), opened.trainer.memory, opened.env
         params = opened.trainer.evaluation_params
     look = references.look_of(played.task, played.settings)
+    _require_room(played, episodes, memory)
+    footprint.require_room_to_play(footprint.recording_bytes(env, params, episodes, look))
     return Recorded(_record(policy, memory, env, params, episodes, intervention, look), played.task)
 
 

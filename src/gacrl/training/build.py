@@ -12,11 +12,13 @@ from gacrl.algorithms import build as build_algorithm
 from gacrl.algorithms.contract import Algorithm
 from gacrl.config.checks import require
 from gacrl.config.run import RunConfig
+from gacrl.evaluation.references import look_of
 from gacrl.messages import interventions
 from gacrl.tasks.task import Task
 from gacrl.training import curriculum, footprint
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import mesh_for
+from gacrl.training.recorder import SHOWN_EPISODES
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.types import Intervention
 
@@ -30,7 +32,8 @@ class Plan:
     bytes_per_seed: int
     """Memory of a seed's training state (networks, optimiser, replay, environments)."""
     bytes_needed: int
-    """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it."""
+    """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it; at the
+    end, the episodes that are kept to look at."""
     devices: tuple[str, ...]
     num_agents: int
     max_cycles: int
@@ -101,7 +104,11 @@ def plan(trainer: Trainer, config: RunConfig) -> Plan:
     """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
     member, devices = member_shapes(trainer), list(trainer.mesh.devices.flat)
     state, working = footprint.size(member), footprint.working_bytes(config, trainer.algorithm, member)
-    needed = 2 * state * config.num_seeds + working * len(devices)
+    look = look_of(tasks.find(config.task), evaluated_settings(config))
+    env, params = trainer.evaluation_env, trainer.evaluation_params
+    recorded = footprint.recording_bytes(env, params, SHOWN_EPISODES, look)
+    states = state * config.num_seeds
+    needed = max(2 * states + working * len(devices), states + recorded)
     footprint.require_room(needed, devices[0])
     learned = jax.tree.leaves(trainer.algorithm.parameters(member.learner))
     return Plan(
