@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak cluster lint types bench bench-short lock clean
+.PHONY: train test soak cluster plain-path lint types bench bench-short lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
@@ -15,7 +15,11 @@ test: $(STAMP)
 soak: $(STAMP)  ## what is too slow for every change
 	"$(BIN)/python" -m pytest -m soak
 
-cluster: $(STAMP)  ## searches on a Ray cluster of two nodes, on this machine
+plain-path:
+	@case "$(CURDIR)" in *" "*) \
+	  echo "Ray cannot start its workers from $(CURDIR): clone into a folder whose path has no space" >&2; exit 2;; esac
+
+cluster: plain-path $(STAMP)  ## searches on a Ray cluster of two nodes, on this machine
 	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --editable ".[dev,ray]"
 	"$(BIN)/python" -m pytest -m cluster
 

@@ -9,7 +9,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import venv
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,8 @@ HEAD, OTHER = "127.0.0.2", "127.0.0.3"
 class Cluster:
     """Nodes with a core each; killing one kills all its processes."""
 
-    def __init__(self, environment: dict[str, str]):
+    def __init__(self, environment: dict[str, str], python: str = sys.executable):
+        self.python = python
         self.environment = {**environment, "RAY_USAGE_STATS_ENABLED": "0"}
         self.folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))  # sockets need short paths
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
@@ -51,7 +54,7 @@ class Cluster:
         port = self.address.rpartition(":")[2]
         where = ["--head", "--port", port] if node == HEAD else ["--address", self.address]
         own = ["--temp-dir", str(self.folder), "--include-dashboard", "false"] if node == HEAD else []
-        ray = [sys.executable, "-m", "ray.scripts.scripts", "start", *where, *own]
+        ray = [self.python, "-m", "ray.scripts.scripts", "start", *where, *own]
         words = [*ray, "--node-ip-address", node, "--num-cpus", "1", "--disable-usage-stats", "--block"]
         with (self.folder / f"{node}.log").open("ab") as log:
             self.nodes[node] = subprocess.Popen(
@@ -132,6 +135,52 @@ def wait_until(condition: Any, driver: subprocess.Popen[str], seconds: float = 4
         assert driver.poll() is None, driver.communicate()[0]
         assert time.monotonic() < end
         time.sleep(0.1)
+
+
+def test_a_python_whose_path_has_a_space_is_refused_at_once(
+    quick_start: dict[str, str], file: Path, tmp_path: Path
+):
+    """Ray's shell takes such a path apart, and Tune would wait for its workers for ever."""
+    venv.create(tmp_path / "new comer")
+    python = tmp_path / "new comer" / "bin" / "python"
+    (own,) = (tmp_path / "new comer").glob("lib/*/site-packages")
+    (own / "all.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+    with closing(Cluster(quick_start, str(python))) as cluster:
+        cluster.start(HEAD)
+        driver = drive(cluster, file, tmp_path / "out")
+        said = driver.communicate(timeout=60)[0]
+    assert driver.returncode == 2
+    assert said.startswith(f"gacrl: Ray cannot start trials on {HEAD}, since the path of its Python has a space")
+    assert str(python) in said and said.count("\n") == 1
+
+
+def test_workers_that_do_not_start_are_told_with_their_last_words(
+    quick_start: dict[str, str], file: Path, tmp_path: Path
+):
+    shell = tmp_path / "bin" / "bash"
+    shell.parent.mkdir()
+    shell.write_text("#!/bin/sh\necho 'bash: not today' >&2\nexit 1\n")
+    shell.chmod(0o755)
+    with closing(Cluster({**quick_start, "PATH": f"{shell.parent}:{os.environ['PATH']}"})) as cluster:
+        cluster.start(HEAD)
+        begun = time.monotonic()
+        driver = drive(cluster, file, tmp_path / "out")
+        said = driver.communicate(timeout=90)[0]
+    assert time.monotonic() - begun < 75
+    assert driver.returncode == 2
+    assert said.startswith(
+        f"gacrl: Ray started no worker on {HEAD} within 45 s (bash: not today): see {cluster.folder}"
+    )
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_make_cluster_says_that_it_needs_a_plain_path(tmp_path: Path):
+    clone = tmp_path / "new comer"
+    clone.mkdir()
+    shutil.copy(Path(__file__).parents[2] / "Makefile", clone)
+    done = subprocess.run(["make", "cluster"], cwd=clone, capture_output=True, text=True)
+    assert done.returncode == 2 and "clone into a folder whose path has no space" in done.stderr
+    assert [path.name for path in clone.iterdir()] == ["Makefile"], "nothing was installed"
 
 
 def test_a_node_and_a_driver_die_and_no_finished_trial_is_lost(cluster: Cluster, file: Path, tmp_path: Path):

@@ -6,7 +6,10 @@ tells Optuna, and goes on with what was under way. All nodes must see the folder
 
 import json
 import os
+import shlex
 import socket
+import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -37,12 +40,15 @@ try:
     from ray import tune  # pyright: ignore[reportMissingImports]
     from ray.tune.schedulers import ASHAScheduler  # pyright: ignore[reportMissingImports]
     from ray.tune.search.optuna import OptunaSearch  # pyright: ignore[reportMissingImports]
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise UserError("--ray needs Ray and Optuna: pip install 'gacrl[ray]'") from error
 
 _REDUCTION = 3
 """Of the trials that reach a rung the best third goes on; rungs are at 1/9 and 1/3 of the planned steps."""
 _REACHABLE_SECONDS = 5.0
+_START_SECONDS = 45.0
+"""A worker process that has not started by then never will: it takes 1 to 10 s."""
 _RETRIES = 3
 """A trial whose process or node died is taken up again so often."""
 
@@ -63,6 +69,7 @@ def ray_search(spec: Spec, out: Path, address: str, cpus: float, gpus: float, wa
     _connect(address)
     stopping = watch.run("search").stop
     try:
+        _require_workers()
         results = _tuner(spec, out, {"cpu": cpus, "gpu": gpus}, missing, tried, watch).fit()
     finally:
         ray.shutdown()
@@ -94,6 +101,55 @@ def _connect(address: str) -> None:
     except (ConnectionError, RuntimeError) as error:
         first = str(error).strip().splitlines()[0]
         raise UserError(f"cannot join the Ray cluster at {address}: {first}") from error
+
+
+def _require_workers() -> None:
+    """Raises UserError where a node cannot start worker processes; Tune would wait for one without a word.
+
+    Trials run in workers with an environment of their own, which Ray starts by a shell that takes their path apart.
+    """
+    nodes = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}
+    end = time.monotonic() + _START_SECONDS
+    ask = ray.remote(num_cpus=0, max_retries=0)(lambda: sys.executable)  # as a lambda it needs no import of ours
+    asked: list[dict[Any, str]] = [
+        {
+            ask.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False), **own).remote(): node
+            for node in nodes
+        }
+        for own in ({}, {"runtime_env": {"env_vars": {"GACRL_WORKER": "1"}}})
+    ]
+    for answers in asked:
+        seconds = max(end - time.monotonic(), 0.0)
+        there, _ = ray.wait(list(answers), num_returns=len(answers), timeout=seconds)
+        alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+        for answer, node in answers.items():
+            if node in alive and answer not in there:
+                raise UserError(_why_none_starts(nodes[node]))
+            if node in alive:
+                _require_plain(answer, nodes[node]["NodeManagerAddress"])
+
+
+def _require_plain(answer: Any, node: str) -> None:
+    try:
+        python = ray.get(answer)
+    except ray.exceptions.RayError as error:
+        raise UserError(f"a worker on {node} failed: {str(error).strip().splitlines()[-1]}") from error
+    if shlex.quote(python) != python:
+        raise UserError(
+            f"Ray cannot start trials on {node}, since the path of its Python has a space or another character that a "
+            f"shell takes apart: {python}; make its environment in a folder with a plain name"
+        )
+
+
+def _why_none_starts(node: Mapping[str, Any]) -> str:
+    """The sentence, with the last line of Ray's log where that lies on this machine."""
+    log = Path(node["RayletSocketName"]).parents[1] / "logs" / "raylet.err"
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    except OSError:
+        lines = []
+    said = f" ({lines[-1].strip()})" if lines else ""
+    return f"Ray started no worker on {node['NodeManagerAddress']} within {_START_SECONDS:.0f} s{said}: see {log} there"
 
 
 class _Follower(tune.Callback, tune.Stopper):  # pyright: ignore[reportUntypedBaseClass]
