@@ -70,5 +70,5 @@ def follow_coverage(past: Coverage, coverage: Float[Array, " E"], done: Bool[Arr
         total=jnp.where(over, 0.0, total),
         steps=jnp.where(over, 0, steps),
         last_episode=jnp.where(over, total / steps, past.last_episode),
-        episode=past.episode + done.sum(),
+        episode=past.episode + done.sum(dtype=jnp.int32),
     )

@@ -104,7 +104,7 @@ def sum_up(episodes: Float[Array, "T E K"], done: Bool[Array, "T E"]) -> Episode
     finished = jnp.where(done[..., None], episodes, 0.0)
     when = done.shape[0] - 1 - jnp.argmax(done.any(1)[::-1])
     return EpisodeSummary(
-        ended=done.sum(),
+        ended=done.sum(dtype=jnp.int32),
         total=finished.sum((0, 1)),
         squares=jnp.square(finished).sum((0, 1)),
         last=finished[when, jnp.argmax(done[when])],

@@ -10,7 +10,7 @@ import numpy as np
 
 from gacrl import tasks
 from gacrl.config.checks import unknown
-from gacrl.envs.environment import Environment
+from gacrl.envs.environment import Environment, EnvParams
 from gacrl.errors import ConfigError
 from gacrl.evaluation.episodes import Look
 from gacrl.evaluation.evaluate import evaluate, stream_key
@@ -88,10 +88,12 @@ def scripted_program(
     """A scripted policy's evaluation, traced once a process."""
     found = tasks.find(task)
     env = found.make(settings)
-    policy, memory = actor(found, name, env)
-    return jax.jit(
-        lambda params, key: evaluate(env, policy, memory, params, key, num_episodes, metrics=found.metrics)
-    )
+
+    def play(params: EnvParams, key: PRNGKey) -> dict[str, jax.Array]:
+        policy, memory = actor(found, name, env)  # in here: its numbers have the precision of the trace
+        return evaluate(env, policy, memory, params, key, num_episodes, metrics=found.metrics)
+
+    return jax.jit(play)
 
 
 def look_of(task: Task, settings: Any) -> Look | None:

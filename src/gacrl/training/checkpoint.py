@@ -149,8 +149,8 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", replay: Replay[An
     """The saved state in the structure of `like` (arrays or their shapes).
 
     prefix: the path of `like` inside the saved state, such as `.learner`. replay: the part of `like` that remembers,
-    of which the empty rows were not saved. Raises UserError for a checkpoint of another architecture, naming the first
-    array that differs.
+    of which the empty rows were not saved. Numbers take the precision of `like`, whatever JAX computed with when they
+    were saved. Raises UserError for a checkpoint of another architecture, naming the first array that differs.
     """
     remembered = _ids(replay)
     path = checkpoint.folder / _TENSORS
@@ -170,13 +170,14 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", replay: Replay[An
                     found = file.get_tensor(name)
             if found is not None and id(leaf) in remembered:
                 found = _with_empty_rows(found, wanted.shape)
-            if found is None or found.shape != wanted.shape or found.dtype != wanted.dtype:
+            if found is None or found.shape != wanted.shape or found.dtype.kind != wanted.dtype.kind:
                 has = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
                 raise UserError(
                     f"{checkpoint.folder} holds another architecture: {name} is {has} there and "
                     f"{wanted.dtype}{list(wanted.shape)} here; use the config.json that it was trained with"
                 )
-            array = jnp.asarray(found)
+            with np.errstate(over="ignore"):  # saved in double precision, and beyond single: infinite
+                array = jnp.asarray(found.astype(wanted.dtype, copy=False))
             loaded.append(jax.random.wrap_key_data(array) if is_key else array)
     return jax.tree_util.tree_unflatten(structure, loaded)
 

@@ -53,7 +53,7 @@ def linear(config: CurriculumConfig, task: Task, settings: Any) -> Curriculum:
     def advance(stage: Stage, env_steps: Int[Array, ""], rollout: Rollout):
         steps = rollout.transitions
         done = steps.terminated | steps.truncated
-        ended, progress = done.sum(), stage.progress
+        ended, progress = done.sum(dtype=jnp.int32), stage.progress
         if config.gate is not None and progress is not None and task.progress is not None:
             reached = jnp.where(done, steps.info[task.progress], 0.0).sum() / jnp.maximum(ended, 1)
             progress += (1.0 - (1.0 - _MEMORY) ** ended) * (reached - progress)

@@ -92,7 +92,8 @@ class Navigation(Environment):
         """Place agents and landmarks uniformly, agents at rest; goals are independent and uniform."""
         num_agents, landmarks = self.num_agents, self.rules.landmarks
         place_key, goal_key, order_key = jax.random.split(key, 3)
-        places = jax.random.uniform(place_key, (num_agents + landmarks, 2), float, -1.0, 1.0)
+        places = jax.random.uniform(place_key, (num_agents + landmarks, 2), jnp.float32, -1.0, 1.0)
+        places = places.astype(float)  # the same starts in double precision
         order = jnp.broadcast_to(jnp.arange(landmarks), (num_agents, landmarks))
         if not self.rules.named:
             order = jax.vmap(jax.random.permutation)(jax.random.split(order_key, num_agents), order)
@@ -100,7 +101,7 @@ class Navigation(Environment):
             positions=places[:num_agents],
             velocities=jnp.zeros((num_agents, 2), places.dtype),
             landmarks=places[num_agents:],
-            goals=jax.random.randint(goal_key, (num_agents,), 0, landmarks),
+            goals=jax.random.randint(goal_key, (num_agents,), 0, landmarks, jnp.int32),
             order=order,
             words=jnp.full(num_agents, -1, jnp.int32),
             clock=jnp.zeros((), jnp.int32),

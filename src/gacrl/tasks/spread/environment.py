@@ -346,7 +346,8 @@ class Spread(SpreadSettings, Environment):
             if key.ndim:
                 return jax.vmap(draw, out_axes=-1)(key)
             size = 2 * entities + self.landmarks
-            return jax.random.uniform(key, (size,), dtype=float, minval=-1.0, maxval=1.0)
+            places = jax.random.uniform(key, (size,), dtype=jnp.float32, minval=-1.0, maxval=1.0)
+            return places.astype(float)  # the same starts in double precision
 
         draws = draw(key)
         places = draws[: 2 * entities].reshape(entities, 2, *copies) * params.arena_scale
