@@ -77,6 +77,23 @@ def test_it_acts_as_the_trained_policy_does(
     np.testing.assert_array_equal(np.sort(policy.messages[-1])[:, -2:], [[0, 1]] * N)
 
 
+@pytest.mark.parametrize("name", ["mappo", "qmix", "graph-qmix", "dial", "ippo"])
+def test_observations_are_enough_to_act_where_a_critic_saw_the_state(
+    name: str, observations: np.ndarray, tmp_path: Path
+):
+    config = preset(name)
+    small = {"network": replace(config.algorithm.network, width=8, parameters=None)}
+    small |= {"replay_capacity": 500} if hasattr(config.algorithm, "replay_capacity") else {}
+    training = replace(config.training, num_envs=2, num_steps=5)
+    run = untrained(
+        replace(config, training=training, algorithm=replace(config.algorithm, **small)), tmp_path / "run"
+    )
+    policy = gacrl.load_policy(run)
+    for greedy in (True, False):
+        actions = policy(observations[0], greedy)
+        assert actions.shape == (N,) and set(actions) <= set(range(5))
+
+
 def test_a_sampling_policy_repeats_its_draws_after_a_reset(policy: gacrl.LoadedPolicy, observations: np.ndarray):
     def episode(seed: int) -> tuple[np.ndarray, np.ndarray]:
         policy.reset(seed=seed)
@@ -105,7 +122,7 @@ def episode_greedy(policy: gacrl.LoadedPolicy, seen: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(N, SEEN - 1), (N + 1, SEEN), (SEEN, N)])
 def test_observations_of_another_shape_are_refused(shape: tuple[int, int], policy: gacrl.LoadedPolicy):
-    with pytest.raises(ValueError, match=rf"= \({N}, {SEEN}\), not \({shape[0]}, {shape[1]}\)"):
+    with pytest.raises(ValueError, match=rf"= \[{N}, {SEEN}\], not \[{shape[0]}, {shape[1]}\]"):
         policy(np.zeros(shape))
 
 
