@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rlax
 
-from gacrl import rollout
+from gacrl import rollout, tasks
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
 from gacrl.evaluation.references import random
 from gacrl.tasks.spread.environment import Spread
@@ -124,3 +124,9 @@ def test_a_cut_off_step_is_bootstrapped_wherever_it_stands():
         np.testing.assert_allclose(found, 10.0, rtol=1e-5)
     found = generalised_advantages(reward, value, value, none, truncated, 0.9, 0.95)
     np.testing.assert_allclose(found, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["spread", "speaker_listener", "reference", "colours", "traffic_junction"])
+def test_where_only_the_time_limit_truncates_few_values_are_computed(name: str):
+    env = tasks.find(name).make(tasks.default_settings(name))
+    assert env.shortest_truncated == env.max_cycles > 1

@@ -135,6 +135,10 @@ class SwitchRiddle(Environment):
         return 4 * self.num_agents - 6
 
     @property
+    def shortest_truncated(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.max_cycles
+
+    @property
     def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return 1 + self.max_cycles
 

@@ -65,6 +65,10 @@ class Navigation(Environment):
         return MOVES * (self.rules.words if self.utters else 1)
 
     @property
+    def shortest_truncated(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.max_cycles
+
+    @property
     def num_symmetries(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return NUM_SYMMETRIES
 

@@ -65,6 +65,10 @@ class TrafficJunction(TrafficSettings, Environment):  # pyright: ignore[reportIn
         return LEVELS[self.level].cars
 
     @property
+    def shortest_truncated(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.steps
+
+    @property
     def roads(self) -> Roads:
         return roads(self.level)
 
