@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_num_cpu_devices", 2)
@@ -51,6 +52,14 @@ def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
     """For modules that start whole runs, or whose programs are small."""
     with compiled_quickly(tmp_path_factory) as environment:
         yield environment
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Types are not checked at run time, as users call: what is wrong comes to our own checks."""
+    jaxtyping_config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping_config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -4,13 +4,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from gacrl import play, tasks
 from gacrl.config import files as configuration
+from gacrl.config.checks import whole
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment
 from gacrl.errors import ConfigError
@@ -69,7 +70,7 @@ class Run:
 
 def train(
     config: RunConfig | str | None = None,
-    seed: int | None = None,
+    seed: SupportsIndex | None = None,
     out: str | Path | None = None,
     watcher: Watcher | None = None,
     env: Any = None,
@@ -94,12 +95,14 @@ def train(
     return Run(ended.folder, ended.config, ended.env_steps, ended.summary)
 
 
-def settled(config: RunConfig | str | None = None, seed: int | None = None, env: Any = None) -> RunConfig:
+def settled(
+    config: RunConfig | str | None = None, seed: SupportsIndex | None = None, env: Any = None
+) -> RunConfig:
     """Return the settings that a preset's name, or settings, a seed and a task stand for. Raises ConfigError."""
     if config is None or isinstance(config, str):
         config = configuration.preset() if config is None else configuration.preset(config)
     _require_kind("config", config, (RunConfig,), "a preset's name or its settings, gacrl.preset('gacrl')")
-    config = config if seed is None else replace(config, seed=seed)
+    config = config if seed is None else replace(config, seed=whole(seed, "run.seed"))
     prepare_jax(config.num_seeds)
     if env is None:
         return config
@@ -109,7 +112,7 @@ def settled(config: RunConfig | str | None = None, seed: int | None = None, env:
 
 def evaluate(
     run: "str | Path | Run",
-    episodes: int = 320,
+    episodes: SupportsIndex = 320,
     arrives: Intervention | Arrives | str | None = None,
     sampled: bool = False,
     env: Any = None,
@@ -127,7 +130,9 @@ def evaluate(
     return {metric: estimated(values) for metric, values in played.items()}
 
 
-def iterate(config: RunConfig | str | None = None, seed: int | None = None, env: Any = None) -> Iterator[Progress]:
+def iterate(
+    config: RunConfig | str | None = None, seed: SupportsIndex | None = None, env: Any = None
+) -> Iterator[Progress]:
     """Train without a run folder, and yield after every chunk and its evaluation: the loop in your hands.
 
     Arguments as those of `train`; `evaluation.interval` says how long a chunk is. Raises ConfigError.
@@ -148,7 +153,9 @@ class Trainer(NamedTuple):
     """(state, key) -> the metrics of K greedy episodes."""
 
 
-def trainer(config: RunConfig | str | None = None, env: Any = None, episodes: int | None = None) -> Trainer:
+def trainer(
+    config: RunConfig | str | None = None, env: Any = None, episodes: SupportsIndex | None = None
+) -> Trainer:
     """Make the functions that train one seed. episodes: of an evaluation; by default as configured.
 
     >>> trainer = gacrl.trainer("ippo", env="reference")
@@ -156,22 +163,22 @@ def trainer(config: RunConfig | str | None = None, env: Any = None, episodes: in
     >>> states, _ = jax.jit(jax.vmap(trainer.chunk, (0, None)))(states, 100)
     """
     config = replace(settled(config, None, env), num_seeds=1)
-    whole = build.make_trainer(config)
-    count = config.evaluation.num_episodes if episodes is None else episodes
+    built = build.make_trainer(config)
+    count = config.evaluation.num_episodes if episodes is None else whole(episodes, "episodes", 1)
 
     def evaluate(state: TrainState, key: PRNGKey) -> dict[str, Float[Array, " K"]]:
         return playing.evaluate(
-            whole.evaluation_env,
-            whole.algorithm.policy(state.learner, False),
-            whole.memory,
-            whole.evaluation_params,
+            built.evaluation_env,
+            built.algorithm.policy(state.learner, False),
+            built.memory,
+            built.evaluation_params,
             key,
             count,
-            whole.intervention,
-            whole.metrics,
+            built.intervention,
+            built.metrics,
         )
 
-    return Trainer(lambda key: whole.init_member(key, whole.algorithm.hyper), whole.chunk_of_one, evaluate)
+    return Trainer(lambda key: built.init_member(key, built.algorithm.hyper), built.chunk_of_one, evaluate)
 
 
 def make_env(name: Any = tasks.DEFAULT, **settings: Any) -> Environment:

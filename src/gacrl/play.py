@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, SupportsIndex, overload
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.config.checks import require, unknown
+from gacrl.config.checks import require, unknown, whole
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment
 from gacrl.errors import UserError
@@ -180,10 +180,13 @@ class LoadedPolicy:
         """What each agent sent in each round of the last step, [R, N, V]; None where the policy says nothing."""
         self.reset()
 
-    def reset(self, seed: int = 0) -> None:
-        """Start an episode: fresh memory, and random draws that follow from the seed."""
+    def reset(self, seed: SupportsIndex = 0) -> None:
+        """Start an episode: fresh memory, and random draws that follow from the seed.
+
+        Raises ConfigError for a seed that is no whole number.
+        """
         self._memory = self._initial_memory
-        self._key = jax.random.key(seed)
+        self._key = jax.random.key(whole(seed, "seed"))
 
     @overload
     def __call__(self, observations: Mapping[Any, Any], greedy: bool = True) -> dict[Any, Any]: ...

@@ -163,7 +163,7 @@ def test_a_mistake_ends_in_one_sentence(
         ("not json", "is not JSON"),
         ("[1]", "must hold a JSON object"),
         ('{"env": {"num_agent": 4}}', "did you mean 'env.num_agents'?"),
-        ('{"env": {"num_agents": "4"}}', "env.num_agents must be a whole number, not '4'"),
+        ('{"env": {"num_agents": "4"}}', "env.num_agents must be a whole number, not the string '4'"),
         ('{"env": {"local_ratio": NaN}}', "env.local_ratio must be between 0 and 1, not nan"),
     ],
 )

@@ -217,7 +217,7 @@ def _changed(file: Path, old: str, new: str) -> Path:
             "algorithm.update_epochs must be a whole number, not 1.5",
         ),
         ("{integer = [1, 4]}", "{integers = [1, 4]}", "algorithm.update_epochs.integers must be one of {uniform"),
-        ("[32, 64]", "[32, 'wide']", "algorithm.network.width must be a whole number, not 'wide'"),
+        ("[32, 64]", "[32, 'wide']", "algorithm.network.width must be a whole number, not the string 'wide'"),
         ("[search]", "[search]\n[more]", "unknown key 'more': "),
         ("metric =", "metric", " is not TOML: "),
     ],

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
-from gacrl.config.checks import between, require, unknown
+from gacrl.config.checks import between, require, take_types, unknown
 from gacrl.config.kinds import COMMUNICATION, EXPLORATION
 
 
@@ -59,6 +59,7 @@ class GacrlPaperConfig:
     critic_hidden: tuple[int, int] = (128, 64)
 
     def __post_init__(self) -> None:
+        take_types("algorithm", self)
         between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "epsilon", "epsilon_end")
         between("algorithm", self, 0.0, 1.0, "epsilon_bonus")
         require(
@@ -123,6 +124,7 @@ class NetworkConfig:
     """Choose the width so that the acting network has about this many parameters; none: take the width."""
 
     def __post_init__(self) -> None:
+        take_types("algorithm.network", self)
         between("algorithm.network", self, 1, 65_536, "width", "vocabulary", "latent_size")
         between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         between("algorithm.network", self, 1, 100, "depth", "rounds")
@@ -183,6 +185,7 @@ class LearningConfig:
     """The progress to follow, at even spaces over the planned environment steps."""
 
     def __post_init__(self) -> None:
+        take_types("algorithm", self)
         between("algorithm", self, 0.0, 1.0, "learning_rate", "learning_rate_end", "gamma")
         between("algorithm", self, 0, 1_000, "n_step")
         between("algorithm", self, 1e-6, 1e6, "max_grad_norm")

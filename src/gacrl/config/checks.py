@@ -1,8 +1,11 @@
-"""What settings are held to: a condition, two bounds, or names that are known. A leaf: it imports no jax."""
+"""What settings are held to: a condition, a type, two bounds, or names that are known. A leaf: it imports no jax."""
 
 import difflib
+import functools
+import reprlib
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import fields, is_dataclass
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gacrl.errors import ConfigError
 
@@ -13,13 +16,82 @@ def require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
+def typed(value: Any, hint: Any, name: str) -> Any:
+    """Return the value as the type that `hint` names, in Python's own numbers. Raises ConfigError with `name`.
+
+    NumPy's integers are whole numbers and its floats are numbers; lists and arrays are tuples, as JSON has no tuples.
+    A text, True, or 4.0 is no whole number.
+    """
+    value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy, JAX or PyTorch
+    origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return value
+    if origin is Literal:
+        require(value in arguments, f"{name} must be one of {', '.join(map(str, arguments))}, not {_told(value)}")
+        return value
+    if origin is tuple:
+        return _typed_tuple(value, arguments, name)
+    if origin is not None and type(None) in arguments:  # X | None
+        return None if value is None else typed(value, Union[arguments[0]], name)  # noqa: UP007
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(str(value))  # infinity where it is too large
+    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
+    wanted = f"of the class {getattr(hint, '__name__', hint)}" if is_dataclass(hint) else wanted
+    matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+    require(matches, f"{name} must be {wanted}, not {_told(value)}")
+    return value
+
+
+def _typed_tuple(value: Any, arguments: tuple[Any, ...], name: str) -> tuple[Any, ...]:
+    require(isinstance(value, list | tuple), f"{name} must be a list, not {_told(value)}")
+    values: list[Any] = list(value)
+    fixed = arguments[-1] is not Ellipsis
+    require(
+        not fixed or len(values) == len(arguments), f"{name} must be {len(arguments)} numbers, not {_told(values)}"
+    )
+    return tuple(typed(item, arguments[0], name) for item in values)
+
+
+def whole(value: Any, name: str, low: int | None = None) -> int:
+    """Return a whole number that a function was given, as Python's int. Raises ConfigError with the argument's name."""
+    number: int = typed(value, int, name)
+    require(low is None or number >= low, f"{name} must be at least {low}, not {number}")
+    return number
+
+
+def take_types(section: str, settings: Any) -> None:
+    """Give every field of a frozen dataclass the type that it declares. Call it first in `__post_init__`.
+
+    Raises ConfigError for a value that has another type.
+    """
+    hints = _hints(type(settings))
+    for field in fields(settings):
+        before = getattr(settings, field.name)
+        value = typed(before, hints[field.name], f"{section}.{field.name}")
+        if value is not before:
+            object.__setattr__(settings, field.name, value)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _told(value: Any) -> str:
+    """A value in a sentence: on one line, and not long."""
+    return f"the string {reprlib.repr(value)}" if isinstance(value, str) else reprlib.repr(value)
+
+
 def between(section: str, settings: object, low: int | float, high: int | float, *names: str) -> None:
-    """Raises ConfigError for a named setting outside the bounds, or NaN; None is no number, and passes."""
+    """Raises ConfigError for a named setting outside the bounds, or NaN; None is no number, and passes.
+
+    The settings have taken their types.
+    """
     for name in names:
         value = getattr(settings, name)
         if value is not None:
             require(
-                isinstance(value, int | float) and low <= value <= high,
+                low <= value <= high,
                 f"{section}.{name} must be between {_shown(low)} and {_shown(high)}, not {value}",
             )
 

@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from gacrl import tasks
 from gacrl.config import presets
 from gacrl.config.algorithms import ALGORITHMS
-from gacrl.config.checks import require, unknown
+from gacrl.config.checks import typed, unknown
 from gacrl.config.former import converted
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, reason
@@ -146,32 +146,5 @@ def _merge(settings: Any, data: Mapping[str, Any], where: str) -> Any:
                 raise ConfigError(f"{where}{key} must be an object of settings, not {value!r}")
             changes[key] = _merge(current, value, f"{where}{key}.")  # pyright: ignore[reportUnknownArgumentType]
         else:
-            changes[key] = _coerce(value, hints[key], where + key)
+            changes[key] = typed(value, hints[key], where + key)
     return replace(settings, **changes)
-
-
-def _coerce(value: Any, hint: Any, where: str) -> Any:
-    """The value as the type that the setting has; JSON has no tuples, and writes 1 for 1.0."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        require(value in arguments, f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
-        return value
-    if origin is tuple and isinstance(value, list | tuple):
-        inner = arguments[0]
-        values: list[Any] = list(value)  # pyright: ignore[reportUnknownArgumentType]
-        fixed = arguments[-1] is not Ellipsis
-        require(
-            not fixed or len(values) == len(arguments),
-            f"{where} must be {len(arguments)} numbers, not {values!r}",
-        )
-        return tuple(_coerce(item, inner, where) for item in values)
-    if origin is not None and type(None) in arguments:  # X | None
-        return None if value is None else _coerce(value, Union[arguments[0]], where)  # noqa: UP007
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(str(value))  # infinity where it is too large
-    if origin is tuple:
-        raise ConfigError(f"{where} must be a list, not {value!r}")
-    wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}.get(hint, str(hint))
-    matches = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
-    require(matches, f"{where} must be {wanted}, not {value!r}")
-    return value

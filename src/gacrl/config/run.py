@@ -5,7 +5,7 @@ from typing import Any
 
 from gacrl import tasks
 from gacrl.config.algorithms import AlgorithmConfig, GacrlConfig
-from gacrl.config.checks import between
+from gacrl.config.checks import between, take_types
 from gacrl.tasks.spread.settings import SpreadSettings
 
 
@@ -22,6 +22,7 @@ class CurriculumConfig:
     count."""
 
     def __post_init__(self) -> None:
+        take_types("curriculum", self)
         between("curriculum", self, 0.0, 1.0, "gate")
         between("curriculum", self, 1, 1e9, "episodes")
 
@@ -41,6 +42,7 @@ class TrainingConfig:
     scramble, drop PROBABILITY, delay STEPS or noise PROBABILITY; nothing by default."""
 
     def __post_init__(self) -> None:
+        take_types("training", self)
         between("training", self, 1, 1e12, "env_steps")
         between("training", self, 1, 1_000_000, "num_envs", "num_steps")
 
@@ -59,6 +61,7 @@ class EvaluationConfig:
     """Steps of an evaluation episode; none: as in training."""
 
     def __post_init__(self) -> None:
+        take_types("evaluation", self)
         between("evaluation", self, 1, 1e12, "interval")
         between("evaluation", self, 1, 100_000, "num_episodes", "final_episodes")
         between("evaluation", self, 1, 1_000_000, "horizon")
@@ -84,6 +87,7 @@ class RunConfig:
     """Members: independent runs with the seeds seed, seed + 1, …"""
 
     def __post_init__(self) -> None:
+        take_types("run", self)
         between("run", self, 0, 2**31 - 1, "seed")
         between("run", self, 1, 10_000, "num_seeds")
 

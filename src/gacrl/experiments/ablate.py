@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from gacrl import tasks
 from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config.algorithms import GacrlConfig
-from gacrl.config.checks import unknown
+from gacrl.config.checks import unknown, whole
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.statistics import (
@@ -119,10 +119,10 @@ class Ablation:
 def ablate(
     config: RunConfig,
     out: Path,
-    seeds: int = 5,
-    env_steps: int | None = None,
+    seeds: SupportsIndex = 5,
+    env_steps: SupportsIndex | None = None,
     parts: Sequence[str] = (),
-    updates: int | None = None,
+    updates: SupportsIndex | None = None,
     watch: Watch | None = None,
 ) -> Ablation | None:
     """Train what is missing under `out`, write `report.html`, `report.md` and `summary.json` there.
@@ -132,7 +132,7 @@ def ablate(
     the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
     not GACRL's, or a folder that holds something else.
     """
-    watch = watch or Watch()
+    watch, seeds = watch or Watch(), whole(seeds, "seeds")
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if not isinstance(config.algorithm, GacrlConfig):
@@ -141,9 +141,9 @@ def ablate(
     for name in parts:
         if name not in known:
             raise UserError(unknown("part", name, list(known)))
-    steps = config.training.env_steps if env_steps is None else env_steps
+    steps = config.training.env_steps if env_steps is None else whole(env_steps, "env_steps")
     configured = config.algorithm.updates
-    updates = max(configured // 2, 1) if updates is None else updates
+    updates = max(configured // 2, 1) if updates is None else whole(updates, "updates")
     config = replace(
         config,
         algorithm=replace(config.algorithm, updates=updates),

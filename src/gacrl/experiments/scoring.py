@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, SupportsIndex
 
 import jax
 import numpy as np
 
 from gacrl import tasks
 from gacrl.adapters import mpe2
-from gacrl.config.checks import require
+from gacrl.config.checks import require, whole
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.evaluation import episodes as recording
 from gacrl.evaluation import references
@@ -50,7 +50,7 @@ class Played:
 
 def score_run(
     run: str,
-    episodes: int,
+    episodes: SupportsIndex,
     change: Change = unchanged,
     backend: Backend = "jax",
     warn: Warn = lambda sentence: None,
@@ -63,7 +63,7 @@ def score_run(
     episodes, horizon, num_agents, task, final: {greedy, sampled}, references} as in `summary.json`, and messages where
     agents send symbols. MPE2 draws its own starts: there, the scripted policies play those. Raises UserError.
     """
-    messages = None
+    messages, episodes = None, whole(episodes, "episodes", 1)
     scripted = _scripted_task(run, task, change)
     if scripted is not None:
         _require_words(run, intervention)
@@ -85,8 +85,8 @@ def score_run(
         "run": run,
         "backend": backend,
         "episodes": episodes,
-        "horizon": played.env.max_cycles,
-        "num_agents": played.env.num_agents,
+        "horizon": int(played.env.max_cycles),
+        "num_agents": int(played.env.num_agents),
         "task": facts,
         "final": {kind: normalised(metrics, beside, facts["scale"]) for kind, metrics in final.items()},
         "references": beside,
@@ -96,7 +96,7 @@ def score_run(
 
 def play(
     run: str,
-    episodes: int,
+    episodes: SupportsIndex,
     change: Change = unchanged,
     intervention: Intervention | None = None,
     sampled: bool = False,
@@ -106,6 +106,7 @@ def play(
 
     Raises UserError.
     """
+    episodes = whole(episodes, "episodes", 1)
     scripted = _scripted_task(run, tasks.DEFAULT if task is None else task, change)
     if scripted is not None:
         _require_words(run, intervention)
@@ -157,7 +158,7 @@ class Recorded(NamedTuple):
 
 def record_run(
     run: str,
-    episodes: int,
+    episodes: SupportsIndex,
     change: Change = unchanged,
     sampled: bool = False,
     warn: Warn = lambda sentence: None,
@@ -165,7 +166,7 @@ def record_run(
     intervention: Intervention | None = None,
 ) -> Recorded:
     """Record episodes of a policy, to look at: the first of those that `score_run` measures."""
-    played = _scripted_task(run, task, change)
+    episodes, played = whole(episodes, "episodes", 1), _scripted_task(run, task, change)
     if played is not None:
         _require_words(run, intervention)
         actor = references.actor(played.task, run, played.env)

@@ -47,7 +47,7 @@ def bring(env: Any) -> tuple[str, Any]:
     ours = tasks.ours(env)
     if ours is not None:
         return ours
-    own = _record(env, getattr(env, "__name__", type(env).__name__))
+    own = _with_plain_numbers(_record(env, getattr(env, "__name__", type(env).__name__)))
     examine(own)
     tasks.bring(own)
     return own.task.name, own.settings
@@ -61,7 +61,7 @@ def _by_name(name: str) -> str:
     source = Path(path)
     with blamed(source):
         thing = _load(source, attribute)
-        own = _record(thing, attribute)
+        own = _with_plain_numbers(_record(thing, attribute))
     own = replace(own, source=source, digest=hashlib.sha256(source.read_bytes()).hexdigest())
     with blamed(source):
         examine(own)
@@ -128,6 +128,15 @@ def _of_environment(kind: type[Environment], instance: Environment) -> Own:
         summary=" ".join((kind.__doc__ or "").split("\n\n")[0].split()) if kind.__doc__ else "",
     )
     return Own(task, instance if is_set else NoSettings())
+
+
+def _with_plain_numbers(own: Own) -> Own:
+    """The same, with Python's numbers in place of NumPy's among the settings, as a file can hold them."""
+    if not is_dataclass(own.settings):
+        return own
+    numpy = {field.name: getattr(own.settings, field.name) for field in fields(own.settings) if field.init}
+    plain = {name: value.item() for name, value in numpy.items() if isinstance(value, np.generic)}
+    return replace(own, settings=replace(own.settings, **plain)) if plain else own  # pyright: ignore[reportArgumentType]
 
 
 def _default(kind: type, name: str) -> Any:

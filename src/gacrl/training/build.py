@@ -109,8 +109,8 @@ def plan(trainer: Trainer, config: RunConfig) -> Plan:
         bytes_per_seed=state,
         bytes_needed=needed,
         devices=tuple(f"{device.platform}:{device.id}" for device in devices),
-        num_agents=trainer.env.num_agents,
-        max_cycles=trainer.env.max_cycles,
+        num_agents=int(trainer.env.num_agents),
+        max_cycles=int(trainer.env.max_cycles),
         notes=tuple(_notes(config)),
     )
 

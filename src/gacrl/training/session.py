@@ -4,13 +4,14 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import jax
 import jax.numpy as jnp
 
 from gacrl import render, tasks
 from gacrl.config import files as configuration
+from gacrl.config.checks import whole
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes, references
@@ -95,9 +96,13 @@ def begin_with(trainer: Trainer, config: RunConfig, parent: Parent) -> TrainStat
     return state._replace(learner=state.learner._replace(**kept))
 
 
-def resume(path: Path, extend: int | None = None, watcher: Watcher | None = None) -> Ended:
-    """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end."""
+def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | None = None) -> Ended:
+    """Go on where a run stopped; with `extend`, up to that many environment steps beyond its end.
+
+    Raises UserError where it cannot go on, ConfigError for an extension that is no whole number above 0.
+    """
     watcher = watcher or Watcher()
+    extend = None if extend is None else whole(extend, "extend", 1)
     folder = RunFolder.open(path)
     with folder.locked() if leads() else nullcontext():
         folder.require_room()
@@ -251,7 +256,7 @@ def _finish(
         },
         "references": references,
         "episodes": num_episodes,
-        "horizon": trainer.evaluation_env.max_cycles,
+        "horizon": int(trainer.evaluation_env.max_cycles),
         "steps_per_second": clock.steps_per_second,
         "compile_seconds": clock.compiling,
         "wall_seconds": clock.wall,

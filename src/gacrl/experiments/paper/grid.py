@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ from scipy import stats
 
 from gacrl.config import files as configuration
 from gacrl.config import presets
+from gacrl.config.checks import whole
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
@@ -116,8 +117,9 @@ class Sweep:
         }
 
 
-def paper_grid(seeds: int = 2, episodes: int = 500) -> Grid:
+def paper_grid(seeds: SupportsIndex = 2, episodes: SupportsIndex = 500) -> Grid:
     """The paper's 27 points, by shaped reward over the first 500 episodes. Raises UserError for impossible sizes."""
+    seeds, episodes = whole(seeds, "seeds"), whole(episodes, "episodes")
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no telling noise from merit")
     if episodes < 1:

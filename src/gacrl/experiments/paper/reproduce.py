@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, SupportsIndex
 
 from gacrl.config import files as configuration
 from gacrl.config import presets
+from gacrl.config.checks import whole
 from gacrl.config.run import EvaluationConfig, RunConfig
 from gacrl.errors import UserError
 from gacrl.experiments.paper import evidence
@@ -104,14 +105,18 @@ def plan(
 
 
 def reproduce(
-    out: Path, seeds: int = 5, episodes: int = EPISODES, extended: bool = False, watch: Watch | None = None
+    out: Path,
+    seeds: SupportsIndex = 5,
+    episodes: SupportsIndex = EPISODES,
+    extended: bool = False,
+    watch: Watch | None = None,
 ) -> Reproduction | None:
     """Train what is missing under `out`, judge every claim, write `report.html` and `report.md` there.
 
     Returns None where the watcher's stop ended it early. Raises UserError for fewer than two seeds, or a folder
     that holds something else.
     """
-    watch = watch or Watch()
+    watch, seeds, episodes = watch or Watch(), whole(seeds, "seeds"), whole(episodes, "episodes")
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
     if episodes < 1:

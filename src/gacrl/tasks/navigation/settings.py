@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
-from gacrl.config.checks import between, require
+from gacrl.config.checks import between, require, take_types
 from gacrl.tasks.task import Metric
 
 Talk: TypeAlias = Literal["messages", "actions"]
@@ -157,6 +157,7 @@ NavigationSettings: TypeAlias = SpeakerListenerSettings | ReferenceSettings | Co
 
 
 def _check(settings: NavigationSettings) -> None:
+    take_types("env", settings)
     between("env", settings, 1, 1_000_000, "max_cycles")
     between("env", settings, 0.0, 1000.0, "goal_bonus")
     require(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias
 
-from gacrl.config.checks import between
+from gacrl.config.checks import between, take_types
 from gacrl.tasks.task import Metric
 
 RewardKind: TypeAlias = Literal["mpe2", "paper", "coverage", "potential"]
@@ -71,6 +71,7 @@ class SpreadSettings:
     """Where files of version 0.1.0 have settings that are the task's."""
 
     def __post_init__(self) -> None:
+        take_types("env", self)
         between("env", self, 1, 10_000, "num_agents", "num_landmarks", "num_agents_start")
         between("env", self, 1, 1_000_000, "max_cycles")
         between("env", self, 1, 10_000, "num_agent_neighbors", "num_landmark_neighbors")
