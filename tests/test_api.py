@@ -414,4 +414,4 @@ def test_ten_agents_for_a_network_of_three_are_refused_with_what_plays_ten(
             gacrl.load_policy(folder, num_agents=10)
         assert "\n" not in str(refused.value)
     graph = untrained(gacrl.preset("ippo", **{"algorithm.network.torso": "graph"}), tmp_path / "graph")
-    assert gacrl.load_policy(graph, num_agents=10)(np.zeros((10, 60))).shape == (10,)
+    assert gacrl.load_policy(graph, num_agents=10).env.num_agents == 10
