@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
-from gacrl.config.checks import between, require, unknown
+from gacrl.config.checks import between, require, take_types, unknown
 from gacrl.tasks.task import Metric
 
 LevelName: TypeAlias = Literal["easy", "medium", "hard"]
@@ -44,6 +44,7 @@ class TrafficSettings:
     none: constant."""
 
     def __post_init__(self) -> None:
+        take_types("env", self)
         require(self.level in LEVELS, unknown("env.level", self.level, LEVELS))
         between("env", self, 0, LEVELS[self.level].grid - 1, "vision")
         between("env", self, 1, 1_000_000, "max_cycles")
