@@ -122,7 +122,7 @@ def episode_greedy(policy: gacrl.LoadedPolicy, seen: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(N, SEEN - 1), (N + 1, SEEN), (SEEN, N)])
 def test_observations_of_another_shape_are_refused(shape: tuple[int, int], policy: gacrl.LoadedPolicy):
-    with pytest.raises(ValueError, match=rf"= \[{N}, {SEEN}\], not \[{shape[0]}, {shape[1]}\]"):
+    with pytest.raises(gacrl.ConfigError, match=rf"= \[{N}, {SEEN}\], not \[{shape[0]}, {shape[1]}\]"):
         policy(np.zeros(shape))
 
 

@@ -1,4 +1,4 @@
-"""Every command and every line of Python in the README works, word for word.
+"""Every command of the README works, and every line of Python in it and in the guide to Python, word for word.
 
 The presets are small ones here, and evaluations short; nothing else is changed.
 """
@@ -28,6 +28,7 @@ COMMANDS = [
     line.split("#")[0].strip() for language, block in BLOCKS if language == "bash" for line in block.splitlines()
 ]
 PYTHON = [block for language, block in BLOCKS if language == "python"]
+GUIDE = (ROOT / "docs" / "guides" / "python.md").read_text(encoding="utf-8")
 
 LONG = {"ablate", "doctor", "reproduce", "sweep"}
 """Minutes each: the first is below, the others have tests of their own in tests/experiments."""
@@ -52,7 +53,12 @@ def room_of_short_schedules(tmp_path_factory, quick_start):
             preset,
             algorithm=algorithm,
             env=replace(preset.env, max_cycles=5),
-            training=replace(preset.training, env_steps=500),
+            training=replace(
+                preset.training,
+                env_steps=500,
+                num_envs=min(preset.training.num_envs, 25),
+                num_steps=min(preset.training.num_steps, 5),
+            ),
             evaluation=replace(preset.evaluation, interval=250, num_episodes=4, final_episodes=8),
         )
 
@@ -61,7 +67,7 @@ def room_of_short_schedules(tmp_path_factory, quick_start):
     def few(run: str, episodes: int, **asked: Any) -> dict[str, Any]:
         return score_run(run, episodes=min(episodes, 4), **asked)
 
-    shortened = {name: ("short", short(presets.preset(name))) for name in ("paper", "gacrl")}
+    shortened = {name: ("short", short(presets.preset(name))) for name in ("paper", "gacrl", "ippo")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "PRESETS", MappingProxyType({**presets.PRESETS, **shortened}))
         patch.setattr(scoring, "score_run", few)
@@ -111,3 +117,19 @@ def test_the_python_of_the_readme(room):
     env = gacrl.make_env("spread")
     observations = np.zeros((3, env.observation_size), np.float32)
     assert names["policy"](observations).shape == (3,)
+
+
+def test_the_python_of_its_guide(room, capsys):
+    """Block after block, in one session that begins with the first: five lines train, evaluate in silence, and plot."""
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE, flags=re.DOTALL)
+    assert len(blocks[0].replace("\n\n", "\n").splitlines()) == 5
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert Path("curve.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert re.search(r"^-?[\d.]+ \[-?[\d.]+, -?[\d.]+\] -?[\d.]+ \[", said), "both returns, with their intervals"
+    assert names["steps"] == [250, 500] and "done in" in said
+    assert names["scores"]["return_agent_mean"].shape == (8, 4)
+    assert set(names["actions"]) == {"agent_0", "agent_1", "agent_2"}
+    assert names["policy"](np.zeros((10, names["policy"].env.observation_size))).shape == (10,)

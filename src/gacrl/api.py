@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from gacrl import play, tasks
 from gacrl.config import files as configuration
-from gacrl.config.checks import whole
+from gacrl.config.checks import require_kind, whole
+from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment, typed_keys
-from gacrl.errors import ConfigError
 from gacrl.evaluation import evaluate as playing
 from gacrl.evaluation.summary import Estimate, estimated
 from gacrl.experiments import scoring
@@ -65,7 +65,7 @@ class Run:
             final = self.summary["final"]["greedy"]
             shown = {name: label for name, label in task.shown(list(final)).items() if name in final}
             reached = ", ".join(f"{label} {final[name]['mean']:.3g}" for name, label in shown.items())
-        return f"Run {self.folder}\n  {self.config.preset} on {task.name}, seeds {seeds}, {steps}\n  {reached}"
+        return f"Run {self.folder}\n  {label(self.config)} on {task.name}, seeds {seeds}, {steps}\n  {reached}"
 
 
 def train(
@@ -85,12 +85,14 @@ def train(
     an instance); by default the configuration's. begin_from: a run whose policy this one starts with. Raises UserError
     (ConfigError for settings) with one sentence.
     """
-    hint = "gacrl.Watcher(progress=…) calls a function"
-    _require_kind("watcher", watcher, (Watcher, type(None)), f"a gacrl.Watcher: {hint}")
+    require_kind(
+        "watcher", watcher, (Watcher, type(None)), "a gacrl.Watcher, such as gacrl.Watcher(progress=print)"
+    )
+    require_kind("out", out, (str, Path, type(None)), "the path of a new folder")
     config = settled(config, seed, env)
     watching = (Watcher() if quiet else teller(config)) + (watcher or Watcher())
     with own.blamed(_source(config)):
-        parent = None if begin_from is None else play.parent(_name(begin_from))
+        parent = None if begin_from is None else play.parent(play.name_of(begin_from))
         ended = session.start(config, None if out is None else Path(out), watching, parent)
     return Run(ended.folder, ended.config, ended.env_steps, ended.summary)
 
@@ -101,7 +103,7 @@ def settled(
     """Return the settings that a preset's name, or settings, a seed and a task stand for. Raises ConfigError."""
     if config is None or isinstance(config, str):
         config = configuration.preset() if config is None else configuration.preset(config)
-    _require_kind("config", config, (RunConfig,), "a preset's name or its settings, gacrl.preset('gacrl')")
+    require_kind("config", config, (RunConfig,), "a preset's name or its settings, gacrl.preset('gacrl')")
     config = config if seed is None else replace(config, seed=whole(seed, "run.seed"))
     prepare_jax(config.num_seeds)
     if env is None:
@@ -126,7 +128,9 @@ def evaluate(
     the seeds; of a single one, over its episodes. Raises UserError.
     """
     name = None if env is None else own.bring(env)[0]
-    played = scoring.play(_name(run), episodes, changing(settings), interventions.of(arrives), sampled, name)
+    played = scoring.play(
+        play.name_of(run), episodes, changing(settings), interventions.of(arrives), sampled, name
+    )
     return {metric: estimated(values) for metric, values in played.items()}
 
 
@@ -201,17 +205,6 @@ def changing(settings: dict[str, Any]) -> Callable[[Any], Any]:
         return configuration.changed(task_settings, settings)
 
     return change
-
-
-def _name(run: "str | Path | Run") -> str:
-    """What `RUN` stands for on the command line."""
-    _require_kind("run", run, (Run, str, Path), "a gacrl.Run, or the folder of one")
-    return str(run.folder) if isinstance(run, Run) else str(run)
-
-
-def _require_kind(name: str, value: Any, kinds: tuple[type, ...], expected: str) -> None:
-    if not isinstance(value, kinds):
-        raise ConfigError(f"{name} must be {expected}, not {value!r} (a {type(value).__name__})")
 
 
 def _source(config: RunConfig) -> Path | None:

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.config.checks import require, unknown, whole
+from gacrl.config.checks import require, require_kind, unknown, whole
 from gacrl.config.run import RunConfig
-from gacrl.envs.environment import Environment
+from gacrl.envs.environment import Environment, as_floats
 from gacrl.errors import UserError
 from gacrl.evaluation.references import FLOORS, noop, playable, random
 from gacrl.tasks import own
@@ -81,7 +81,11 @@ def open_run(
     found, warnings = checkpoint.newest(folder.checkpoints, kind)
     for warning in warnings:
         warn(warning)
-    learners = session.load_learners(found, trainer)
+    try:
+        learners = session.load_learners(found, trainer)
+    except UserError as error:
+        _require_same_task(path, config, changed)
+        raise error
     if member is not None:
         _require_member(path, member, config.num_seeds)
         changed = replace(changed, seed=config.seed + member, num_seeds=1)
@@ -95,8 +99,25 @@ def _require_playable(path: Path, trained: RunConfig, asked: RunConfig) -> None:
     if getattr(trained.algorithm, "fixed_team", False) and before != now:
         raise UserError(
             f"{path} was trained with {before} agents, and the paper's GACRL is built for their number (equation (10) "
-            "puts all messages side by side): leave --num-agents out"
+            "puts all messages side by side): leave num_agents out, or train the preset gacrl-teams, which plays "
+            "in any number"
         )
+
+
+def _require_same_task(path: Path, trained: RunConfig, asked: RunConfig) -> None:
+    """Blame the changed settings, where there are some, for parameters that do not fit."""
+    now = configuration.to_dict(asked)["env"]
+    changes = [
+        f"{name}={now[name]}"
+        for name, before in configuration.to_dict(trained)["env"].items()
+        if before != now[name]
+    ]
+    require(
+        not changes,
+        f"{path} does not play with {', '.join(changes)}: its network was built for what an agent saw in training; "
+        "leave the change out, or train with algorithm.network.torso graph, which plays in any number (as the preset "
+        "gacrl-teams does)",
+    )
 
 
 def _require_member(path: Path, member: int, num_seeds: int) -> None:
@@ -199,8 +220,7 @@ class LoadedPolicy:
         another shape, or that are not finite.
         """
         named = isinstance(observations, Mapping)
-        rows = list(observations.values()) if named else observations
-        features = self.env.stack(rows) if named else np.asarray(rows, np.float32)
+        features = self.env.stack(list(observations.values())) if named else as_floats(observations)
         expected = (self.env.num_agents, self.env.observation_size)
         require(
             features.shape == expected,
@@ -216,6 +236,13 @@ class LoadedPolicy:
         return dict(zip(observations, self.env.unstack(actions), strict=True)) if named else actions
 
 
+def name_of(run: Any) -> str:
+    """Return what names a run: the folder of a `gacrl.Run`, or the text or path itself. Raises ConfigError."""
+    run = getattr(run, "folder", run)
+    require_kind("run", run, (str, Path), "a gacrl.Run, or the folder of one")
+    return str(run)
+
+
 def load_policy(run: Any, env: Any = None, **settings: Any) -> LoadedPolicy:
     """Load the policy of a run: a `Run`, its folder, `FOLDER@k`, `pretrained:NAME`, or `random` and `noop`.
 
@@ -223,7 +250,7 @@ def load_policy(run: Any, env: Any = None, **settings: Any) -> LoadedPolicy:
     training (num_agents=10). Raises UserError where there is no such run, and ConfigError for a setting that its task
     does not have. Other scripted policies need the exact state, which observations alone do not give.
     """
-    name = str(getattr(run, "folder", run))
+    name = name_of(run)
     if name in FLOORS:
         task, base = own.bring(tasks.DEFAULT if env is None else env)
         env = tasks.find(task).make(configuration.changed(base, settings))

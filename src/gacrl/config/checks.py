@@ -59,6 +59,12 @@ def whole(value: Any, name: str, low: int | None = None) -> int:
     return number
 
 
+def require_kind(name: str, value: Any, kinds: tuple[type, ...], expected: str) -> None:
+    """Raises ConfigError, with the value and its type, for an argument of another type than these."""
+    kind = type(value).__name__
+    require(isinstance(value, kinds), f"{name} must be {expected}, not {reprlib.repr(value)} (of type {kind})")
+
+
 def take_types(section: str, settings: Any) -> None:
     """Give every field of a frozen dataclass the type that it declares. Call it first in `__post_init__`.
 

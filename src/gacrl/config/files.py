@@ -1,5 +1,6 @@
 """How the settings of a run load and save: to and from plain data, with an error that names what is wrong."""
 
+import copy
 import dataclasses
 import hashlib
 import json
@@ -11,7 +12,7 @@ from typing import Any, get_type_hints
 from gacrl import tasks
 from gacrl.config import presets
 from gacrl.config.algorithms import ALGORITHMS
-from gacrl.config.checks import typed, unknown
+from gacrl.config.checks import require, typed, unknown
 from gacrl.config.former import converted
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, reason
@@ -27,12 +28,13 @@ def preset(name: str = presets.DEFAULT_PRESET, **changes: Any) -> RunConfig:
     """
     base = presets.preset(_text(name, "the preset"))
     data: dict[str, Any] = {}
-    for dotted, value in changes.items():
+    for dotted, value in sorted(changes.items(), key=lambda change: change[0].count(".")):
         *sections, setting = dotted.split(".")
-        inner = data
+        inner: Any = data
         for section in sections:
             inner = inner.setdefault(section, {})
-        inner[setting] = value
+            require(isinstance(inner, dict), f"{dotted} cannot be set beside {section}={inner!r}: leave one out")
+        inner[setting] = copy.deepcopy(value)  # further changes may lie inside it
     return from_dict(data, base)
 
 

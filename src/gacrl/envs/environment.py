@@ -1,15 +1,20 @@
 """What an environment is: pure functions over one copy, vmapped by whoever needs many."""
 
+import functools
+import inspect
+import reprlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from gacrl.config.checks import require
+from gacrl.errors import ConfigError
 from gacrl.types import Entities, Metrics, Observation, PRNGKey
 
 EnvState: TypeAlias = Any
@@ -57,6 +62,11 @@ class Environment(ABC):
     observes_state: ClassVar[bool] = False
     """Whether `observe_many` makes observations from states, which is then cheaper than to hand them through."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if inspect.isfunction(vars(cls).get("step")):
+            cls.step = _refusing_odd_actions(cls.step)
+
     def default_params(self) -> EnvParams:
         """The numbers of the task, where it has some."""
         return ()
@@ -69,7 +79,10 @@ class Environment(ABC):
     def step(
         self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams = ()
     ) -> tuple[EnvState, TimeStep]:
-        """Let every agent act once. action: [N] indices, or [N, A] numbers in [0, 1]."""
+        """Let every agent act once. action: [N] indices, or [N, A] numbers in [0, 1].
+
+        Raises ConfigError for an action out of range, where its numbers are known: not inside a compiled program.
+        """
 
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
         """The observation around bare feature vectors, as other programs hand them out: everyone is there, and may do
@@ -81,7 +94,7 @@ class Environment(ABC):
 
         Raises ConfigError where it does not fit.
         """
-        rows = [np.asarray(row, np.float32).reshape(-1) for row in rows]
+        rows = [as_floats(row).reshape(-1) for row in rows]
         sizes = [row.size for row in rows]
         require(
             sizes == [self.observation_size] * self.num_agents,
@@ -190,3 +203,42 @@ def side_by_side(seen: Sequence[Float[Array, " _"]], roles: Sequence[int] | None
     length = max(numbers.shape[0] for numbers in seen)
     rows = jnp.stack([jnp.pad(numbers, (0, length - numbers.shape[0])) for numbers in seen])
     return jnp.concatenate([rows, jax.nn.one_hot(jnp.asarray(list(roles)), max(roles) + 1)], axis=1)
+
+
+def _refusing_odd_actions(step: Callable[..., Any]) -> Callable[..., Any]:
+    """The same step, that refuses actions out of range. Traced ones pass: a compiled program has no check in it."""
+
+    @functools.wraps(step)
+    def checked(self: Environment, *given: Any, **named: Any) -> Any:
+        action = given[1] if len(given) > 1 else named.get("action")
+        known = action is not None and not any(
+            isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(action)
+        )
+        if known:
+            _require_actions(self, action)
+        return step(self, *given, **named)
+
+    return checked
+
+
+def _require_actions(env: Environment, action: Any) -> None:
+    continuous, numbers = env.continuous_actions, as_floats(action, "actions")
+    shape = (env.num_agents, env.num_actions) if continuous else (env.num_agents,)
+    fits = numbers.shape[: len(shape)] == shape  # copies may stand behind
+    require(fits, f"actions must have the shape {list(shape)}, not {list(numbers.shape)}")
+    highest = 1 if continuous else env.num_actions - 1
+    wanted = f"numbers between 0 and {highest}" if continuous else f"whole numbers from 0 to {highest}"
+    odd = ~((numbers >= 0) & (numbers <= highest))
+    if not continuous:
+        odd |= numbers != np.round(numbers)
+    if odd.any():
+        place = tuple(np.argwhere(odd)[0])
+        raise ConfigError(f"the action of agent {place[0]} is {numbers[place]:g}: actions are {wanted}")
+
+
+def as_floats(numbers: Any, what: str = "observations") -> np.ndarray:
+    """Return numbers as an array of float32. Raises ConfigError for what are none."""
+    try:
+        return np.asarray(numbers, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{what} must be an array of numbers, not {reprlib.repr(numbers)}") from error

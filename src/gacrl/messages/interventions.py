@@ -10,28 +10,32 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.config.checks import require, unknown
+from gacrl.config.checks import require, typed, unknown, whole
 from gacrl.errors import ConfigError
 from gacrl.types import Arrives, Intervention, PRNGKey, Words
 
 Ask: TypeAlias = Callable[[Arrives], Words]
 RoundOfWords: TypeAlias = Float[Array, "E N V"]
+Shape: TypeAlias = Words | Float[jax.ShapeDtypeStruct, "E R N V"]
+"""What an intervention begins with: of the words, their shape alone is known."""
 
 
-def silence(agents: Sequence[int] | None = None) -> Intervention:
-    """Nobody hears these agents, counted from 0; by default nobody hears anybody."""
+def silence(agents: Sequence[int] | int | None = None) -> Intervention:
+    """Nobody hears these agents (or this one), counted from 0; by default nobody hears anybody."""
+    silenced = [] if agents is None else [_agent("silence", agent) for agent in np.atleast_1d(agents)]
 
-    def init(words: Words) -> Any:
-        _require_agents("silence", agents or (), words)
+    def init(words: Shape) -> Any:
+        _require_agents("silence", silenced, words)
         return ()
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         num_envs, _, num_agents, _ = _shape(ask)
         muted = jnp.ones(num_agents, bool)
         if agents is not None:
-            muted = jnp.zeros(num_agents, bool).at[jnp.asarray(agents, int)].set(True)
+            muted = jnp.zeros(num_agents, bool).at[jnp.asarray(silenced, int)].set(True)
         return Arrives(kept=jnp.broadcast_to(~muted, (num_envs, num_agents, num_agents)))
 
     return Intervention("silence", arrives, init)
@@ -39,8 +43,9 @@ def silence(agents: Sequence[int] | None = None) -> Intervention:
 
 def swap(one: int, other: int) -> Intervention:
     """Each of the two agents is heard with the words of the other."""
+    one, other = _agent("swap", one), _agent("swap", other)
 
-    def init(words: Words) -> Any:
+    def init(words: Shape) -> Any:
         _require_agents("swap", (one, other), words)
         return ()
 
@@ -57,7 +62,7 @@ def scramble() -> Intervention:
     ConfigError for a single episode.
     """
 
-    def init(words: Words) -> Any:
+    def init(words: Shape) -> Any:
         require(words.shape[0] > 1, "to scramble messages takes at least two episodes side by side")
         return ()
 
@@ -66,7 +71,7 @@ def scramble() -> Intervention:
 
 def drop(probability: float) -> Intervention:
     """Each edge loses what is said along it in a step, all rounds of it, with this probability."""
-    _require_share("drop", probability)
+    probability = _share("drop", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         num_envs, _, num_agents, _ = _shape(ask)
@@ -77,7 +82,7 @@ def drop(probability: float) -> Intervention:
 
 def noise(probability: float) -> Intervention:
     """Each word is replaced by a symbol drawn at random with this probability."""
-    _require_share("noise", probability)
+    probability = _share("noise", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         *words, symbols = _shape(ask)
@@ -99,10 +104,10 @@ class _Late(NamedTuple):
 
 def delay(steps: int) -> Intervention:
     """Words arrive this many steps after they were said; in an episode's first steps nothing arrives."""
-    fits = steps == int(steps) and 1 <= steps <= 1_000
-    require(fits, f"delay must be a whole number of steps between 1 and 1000, not {steps!r}")
+    steps = whole(steps, "delay")
+    require(1 <= steps <= 1_000, f"delay must be a whole number of steps between 1 and 1000, not {steps}")
 
-    def init(words: Words) -> _Late:
+    def init(words: Shape) -> _Late:
         return _Late(jnp.zeros((steps, *words.shape)), jnp.zeros(words.shape[0], jnp.int32))
 
     def arrives(state: _Late, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -206,7 +211,7 @@ def _shape(ask: Ask) -> tuple[int, int, int, int]:
     return jax.eval_shape(ask, Arrives()).shape
 
 
-def _require_agents(name: str, agents: Sequence[int], words: Words) -> None:
+def _require_agents(name: str, agents: Sequence[int], words: Shape) -> None:
     num_agents = words.shape[2]
     for agent in agents:
         require(
@@ -215,5 +220,11 @@ def _require_agents(name: str, agents: Sequence[int], words: Words) -> None:
         )
 
 
-def _require_share(name: str, probability: float) -> None:
+def _agent(name: str, agent: Any) -> int:
+    return whole(agent, f"an agent to {name}")
+
+
+def _share(name: str, probability: Any) -> float:
+    probability = typed(probability, float, name)
     require(0.0 <= probability <= 1.0, f"{name} must be a probability between 0 and 1, not {probability!r}")
+    return probability

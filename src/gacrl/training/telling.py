@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.training.build import Plan
 from gacrl.training.loop import Progress
@@ -32,7 +33,7 @@ def teller(config: RunConfig) -> Watcher:
         print(line, file=sys.stderr, flush=True)
 
     def planned(folder: RunFolder, config: RunConfig, plan: Plan) -> None:
-        tell(f"{folder.path}: {config.preset} on {config.task}, {plan.parameters:,} parameters")
+        tell(f"{folder.path}: {presets.label(config)} on {config.task}, {plan.parameters:,} parameters")
         for note in plan.notes:
             tell(note)
 

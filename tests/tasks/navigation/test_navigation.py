@@ -183,7 +183,7 @@ def test_floors_and_ceilings(name: str, policy: str, low: float, high: float):
 @pytest.mark.parametrize(
     ("name", "settings", "sentence"),
     [
-        ("colours", {"talk": "actions"}, "env.talk must be one of messages, not 'actions'"),
+        ("colours", {"talk": "actions"}, "env.talk must be one of messages, not the string 'actions'"),
         ("colours", {"num_agents": 1}, "env.num_agents must be between 2 and 10, not 1"),
         ("colours", {"num_agents": 99}, "env.num_agents must be between 2 and 10, not 99"),
         ("reference", {"local_ratio": 2.0}, "env.local_ratio must be between 0 and 1, not 2.0"),

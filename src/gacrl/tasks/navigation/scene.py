@@ -16,7 +16,7 @@ def scene(settings: NavigationSettings, state: NavigationState, params: Navigati
     reached = float(RADII[0])
     _, distance = pairwise_offsets(state.positions, state.landmarks)
     seeks = jnp.asarray(settings.rules.seeks)
-    sought = (state.goals[:, None] == jnp.arange(state.landmarks.shape[0])) & seeks[:, None]
+    sought = (state.goals[:, None] == jnp.arange(state.landmarks.shape[0])[None]) & seeks[:, None]
     corner = jnp.ones(2)
     return compose(
         agents=discs(state.positions, _SIZE, colour=jnp.where(seeks, state.goals, PLAIN)),

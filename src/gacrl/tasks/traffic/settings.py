@@ -44,6 +44,7 @@ class TrafficSettings:
     none: constant."""
 
     def __post_init__(self) -> None:
+        take_types("env", self)
         require(self.level in LEVELS, unknown("env.level", self.level, LEVELS))
         take_types("env", self)
         between("env", self, 0, LEVELS[self.level].grid - 1, "vision")
