@@ -20,7 +20,7 @@ from gacrl.types import Entities, Observation
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
-KINDS = ("commnet", "discrete")
+KINDS = ("commnet", "discrete", "tarmac", "ic3net")
 """Soft symbols are the discrete ones where nothing is drawn; they differ in their gradients."""
 
 
@@ -102,7 +102,13 @@ def test_the_whole_world_may_be_moved():
 
 
 @pytest.mark.parametrize(
-    ("kind", "limits"), [("commnet", {}), ("discrete", {"nearest_landmarks": 2, "nearest_agents": 2})]
+    ("kind", "limits"),
+    [
+        ("commnet", {}),
+        ("discrete", {"nearest_landmarks": 2, "nearest_agents": 2}),
+        ("tarmac", {"nearest_agents": 2}),
+        ("ic3net", {"nearest_agents": 2}),
+    ],
 )
 def test_padding_is_not_there(kind: str, limits: dict[str, int]):
     """Three agents and two landmarks, and the same with padding in between, wherever that stands."""

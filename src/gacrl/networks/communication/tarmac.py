@@ -24,7 +24,8 @@ class Tarmac(Communication):
     Messages are numbers, in play too.
     """
 
-    signature: tuple[Linear, ...]
+    signature: tuple[Float[Array, "D H"], ...]
+    """Without a bias, which adds the same to all scores of a receiver: its gradient would be rounding alone."""
     value: tuple[Linear, ...]
     query: tuple[Linear, ...]
     merge: tuple[Linear, ...]
@@ -33,7 +34,7 @@ class Tarmac(Communication):
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         width, size, value_size = config.width, config.signature_size, config.value_size
         signature, value, query, merge = jax.random.split(key, (4, config.rounds))
-        self.signature = tuple(Linear(width, size, k, gain) for k in signature)
+        self.signature = tuple(Linear(width, size, k, gain).weight for k in signature)
         self.value = tuple(Linear(width, value_size, k, gain) for k in value)
         self.query = tuple(Linear(width, size, k, gain) for k in query)
         self.merge = tuple(Linear(value_size + width, width, k, gain) for k in merge)
@@ -52,7 +53,7 @@ class Tarmac(Communication):
         for number, (signature, value, query, merge) in enumerate(
             zip(self.signature, self.value, self.query, self.merge, strict=True)
         ):
-            message = jnp.concatenate([signature(hidden), value(hidden)], axis=-1)
+            message = jnp.concatenate([hidden @ signature.T, value(hidden)], axis=-1)
             said.append(message)
             others = received(message, near, number, len(self.value))
             heard = jnp.concatenate([others, message[:, None]], axis=1)  # one's own words do not travel
