@@ -9,8 +9,15 @@ from gacrl.envs.environment import observe
 from gacrl.errors import ConfigError
 from gacrl.networks.arrives import arriving
 from gacrl.networks.encoder import kl_divergence, sample_latent
-from gacrl.networks.graph import heard_adjacency, nearest_speakers, neighbour_sum, proximity_adjacency
-from gacrl.networks.messages import gumbel_softmax, most_likely_symbol
+from gacrl.networks.graph import (
+    attend,
+    attend_to_speakers,
+    heard_adjacency,
+    nearest_speakers,
+    neighbour_sum,
+    proximity_adjacency,
+)
+from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
 from gacrl.types import Arrives
 
 V, N = 4, 3
@@ -75,6 +82,51 @@ def test_most_likely_symbol():
     np.testing.assert_array_equal(
         most_likely_symbol(jnp.array([[0.0, 2.0, 1.0], [5.0, 2.0, 1.0]])), [[0, 1, 0], [1, 0, 0]]
     )
+
+
+def test_a_gate_opens_as_often_as_its_sigmoid_and_learns_by_the_soft_one():
+    logits = jnp.array([-1.0, 0.5, 3.0])
+    noise = jax.random.logistic(jax.random.key(0), (4_000, 3))
+    for temperature in (0.3, 2.0):
+        opened = gumbel_sigmoid(jnp.broadcast_to(logits, noise.shape), noise, temperature)
+        np.testing.assert_allclose(opened, opened.round(), atol=1e-6)
+        chance = 1 / (1 + np.exp(-np.asarray(logits)))
+        assert np.abs(opened.mean(0) - chance).max() < 5 * np.sqrt(0.25 / 4_000)
+        slope = jax.grad(lambda logits: gumbel_sigmoid(logits, noise[0], temperature).sum())(logits)  # noqa: B023
+        soft = 1 / (1 + np.exp(-np.asarray(logits + noise[0]) / temperature))
+        np.testing.assert_allclose(slope, soft * (1 - soft) / temperature, rtol=1e-4)
+    np.testing.assert_array_equal(gumbel_sigmoid(logits, None, 1.0), [0, 1, 1])
+
+
+# Attention to those who spoke.
+
+VALUES = jnp.array([[[1.0, 2.0], [3.0, 5.0], [-1.0, 4.0]]])
+SCORE = jnp.log(jnp.array([[1.0, 3.0, 2.0]]))
+
+
+def test_who_is_silent_is_as_a_cut_edge():
+    """Whatever the scores; and exactly nothing is heard where nobody spoke."""
+    for score in (SCORE, SCORE * 100, SCORE.at[0, 1].set(-jnp.inf)):
+        for spoke in ([1.0, 1.0, 1.0], [1.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]):
+            spoke = jnp.array([spoke])
+            expected = attend(VALUES, jnp.where(spoke > 0, score, -jnp.inf))
+            np.testing.assert_allclose(attend_to_speakers(VALUES, score, spoke), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoke", "shares"),
+    [
+        ([1.0, 1.0, 0.0], [1 / 4, 3 / 4, 2 / 6]),  # the third would have 2 of 1 + 3 + 2
+        ([0.0, 1.0, 0.0], [1 / 4, 1.0, 2 / 5]),
+        ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0]),
+    ],
+)
+def test_whether_to_speak_has_the_gradient_of_what_would_be_heard(spoke: list[float], shares: list[float]):
+    slope = jax.jacobian(lambda spoke: attend_to_speakers(VALUES, SCORE, spoke)[0])(jnp.array([spoke]))[:, 0]
+    np.testing.assert_allclose(slope, np.asarray(VALUES)[0].T * shares, rtol=1e-5)
+    away = SCORE.at[0, 2].set(-jnp.inf)
+    slope = jax.jacobian(lambda spoke: attend_to_speakers(VALUES, away, spoke)[0])(jnp.array([spoke]))[:, 0]
+    assert np.isfinite(slope).all() and (slope[:, 2] == 0).all()
 
 
 # Edges, and what arrives along them.

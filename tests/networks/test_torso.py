@@ -20,7 +20,7 @@ from gacrl.types import Entities, Observation
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
-KINDS = ("commnet", "discrete")
+KINDS = ("commnet", "discrete", "tarmac", "ic3net")
 """Soft symbols are the discrete ones where nothing is drawn; they differ in their gradients."""
 
 
@@ -57,9 +57,10 @@ def outputs(network: AgentNetwork, env: Spread, state: SpreadState, ring: jax.Ar
     seen = env.observe(state, env.default_params()._replace(**masks))
     graphs = [seen]
     if ring is not None:
-        graphs += [seen._replace(positions=None), seen._replace(adjacency=ring)]
+        everyone = ~jnp.eye(ring.shape[0], dtype=bool)
+        graphs += [seen._replace(adjacency=everyone), seen._replace(adjacency=ring)]
     heads = [network(graph)[0].head for graph in graphs]
-    return Graphs(*[*heads, None, None][:3], network.torso(seen))
+    return Graphs(*[*heads, None, None][:3], network.torso(seen).hidden)
 
 
 def same(found: Graphs, expected: Graphs, order: Any = slice(None), atol: float = 1e-5) -> None:
@@ -102,7 +103,13 @@ def test_the_whole_world_may_be_moved():
 
 
 @pytest.mark.parametrize(
-    ("kind", "limits"), [("commnet", {}), ("discrete", {"nearest_landmarks": 2, "nearest_agents": 2})]
+    ("kind", "limits"),
+    [
+        ("commnet", {}),
+        ("discrete", {"nearest_landmarks": 2, "nearest_agents": 2}),
+        ("tarmac", {"nearest_agents": 2}),
+        ("ic3net", {"nearest_agents": 2}),
+    ],
 )
 def test_padding_is_not_there(kind: str, limits: dict[str, int]):
     """Three agents and two landmarks, and the same with padding in between, wherever that stands."""
@@ -170,7 +177,7 @@ def test_a_task_without_space_is_a_graph_of_one():
     env = Probe()
     torso = drawn(torsos.make, env, config())
     seen = Observation(None, None, None, None, None)._replace(features=jnp.array([[1.0, 0.5], [1.0, 0.5]]))
-    act = eqx.filter_jit(lambda seen: torso(seen))
+    act = eqx.filter_jit(lambda seen: torso(seen).hidden)
     same = act(seen)
     np.testing.assert_array_equal(same[0], same[1])
     other = act(seen._replace(features=seen.features.at[1].set(-1.0)))
@@ -228,7 +235,7 @@ def look(beacons: list[list[float]], other: list[list[float]] = FIRST_OTHER, **s
     rows = [[0.7, *np.ravel([*beacons, *other])], [0.7, *np.ravel([*rest, *FIRST_OTHER])]]
     seen = observe(jnp.asarray(rows, jnp.float32), num_actions=3)
     torso = drawn(torsos.make, env, config(**settings))
-    return np.asarray(eqx.filter_jit(lambda torso, seen: torso(seen))(torso, seen))
+    return np.asarray(eqx.filter_jit(lambda torso, seen: torso(seen).hidden)(torso, seen))
 
 
 def changed(things: list[list[float]], row: int, **numbers: float) -> list[list[float]]:
@@ -327,7 +334,7 @@ def test_a_network_learns_from_features():
     rows = [[0.7, *np.ravel([*HERE, *FIRST_OTHER])], [0.2, *np.ravel([*HERE, *FIRST_OTHER])]]
     seen = observe(jnp.asarray(rows, jnp.float32), num_actions=3)
     seen = seen._replace(features=seen.features.at[:, -2].set(0.8))  # of the other agent
-    slope = eqx.filter_jit(eqx.filter_grad(lambda torso: jnp.square(torso(seen)).sum()))(torso)
+    slope = eqx.filter_jit(eqx.filter_grad(lambda torso: jnp.square(torso(seen).hidden).sum()))(torso)
     # Offsets are five numbers: of the rival to the landmark, and of the agent to it; then what is told of both.
     assert (np.abs(slope.rival.layers[0].weight).max(0)[10:] > 1e-4).all()
     assert np.abs(slope.landmark.layers[0].weight).max(0)[1 + 5] > 1e-4

@@ -102,6 +102,10 @@ class Talk(NamedTuple):
 TALKS = {
     **{f"discrete, {text}": Talk(SYMBOLS, text) for text in EVERY},
     "commnet, recurrent, drop 0.4": Talk(COMMNET, "drop 0.4"),
+    "gated, noise 0.5": Talk(replace(SYMBOLS, gate=True), "noise 0.5"),
+    "ic3net, swap 0 2": Talk(replace(SYMBOLS, communication="ic3net"), "swap 0 2"),
+    "tarmac, scramble": Talk(replace(SYMBOLS, communication="tarmac"), "scramble"),
+    "told, recurrent, delay 2": Talk(replace(SYMBOLS, communication="told", recurrent=True), "delay 2"),
     "dial, recurrent, delay 2": Talk(DIAL, "delay 2"),
     "dial, recurrent, swap 0 2": Talk(DIAL, "swap 0 2"),
 }

@@ -96,16 +96,25 @@ class NetworkConfig:
     latent_size: int = 16
     """Numbers of the code."""
     communication: str = "none"
-    """What agents send: none, commnet (averages of hidden states), dial (regularised units), discrete or soft
-    (Gumbel-Softmax symbols, one-hot when played or not), or a kind of your own (examples/own_messages.py)."""
+    """What agents send: none, commnet (averages of hidden states), ic3net (the same, through a gate), tarmac (values
+    that receivers ask for), dial (regularised units), discrete or soft (Gumbel-Softmax symbols, one-hot when played or
+    not), told (all that they see), or a kind of your own (examples/own_messages.py)."""
     rounds: int = 1
-    """Rounds of messages within a step (CommNet, symbols)."""
+    """Rounds of messages within a step (CommNet, IC3Net, TarMAC, symbols)."""
     vocabulary: int = 8
     """Symbols of a message; units of a DIAL message."""
     symbols: Literal["straight_through", "soft"] = "straight_through"
     """Discrete symbols while learning: one-hot with the gradient of the soft sample, or soft; one-hot when played."""
     symbol_noise: float = 1.0
-    """Scale of the Gumbel noise on symbols while learning."""
+    """Scale of the noise on symbols, and on their gate, while learning."""
+    gate: bool = False
+    """Agents may say nothing in a round instead of a symbol (discrete, soft)."""
+    word_price: float = 0.0
+    """A loss for each symbol that is said, so that agents with a gate speak where it pays."""
+    signature_size: int = 16
+    """Numbers of a TarMAC message by which receivers choose whom to attend to."""
+    value_size: int = 32
+    """And its numbers that are taken in."""
     speaker_identity: bool = False
     """A listener is told which agent a message comes from; ties the network to the number of agents."""
     second_look: bool = False
@@ -126,10 +135,11 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         take_types("algorithm.network", self)
         between("algorithm.network", self, 1, 65_536, "width", "vocabulary", "latent_size")
+        between("algorithm.network", self, 1, 65_536, "signature_size", "value_size")
         between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         between("algorithm.network", self, 1, 100, "depth", "rounds")
         between("algorithm.network", self, 0.0, 100.0, "dial_noise", "symbol_noise", "look_sharpness")
-        between("algorithm.network", self, 0.0, 1e6, "radius")
+        between("algorithm.network", self, 0.0, 1e6, "radius", "word_price")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")
         require(
             self.torso == "graph" or not self.second_look,
@@ -137,6 +147,14 @@ class NetworkConfig:
         )
         kind = self.communication
         require(kind in COMMUNICATION, unknown("algorithm.network.communication", kind, COMMUNICATION))
+        require(
+            kind in ("discrete", "soft") or not self.gate,
+            f"algorithm.network.gate needs algorithm.network.communication discrete or soft, not {kind}",
+        )
+        require(
+            self.gate or not self.word_price,
+            "algorithm.network.word_price needs algorithm.network.gate: agents without it cannot say less",
+        )
 
 
 @dataclass(frozen=True)

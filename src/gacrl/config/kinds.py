@@ -11,6 +11,9 @@ COMMUNICATION: dict[str, Any] = {
     "none": "gacrl.networks.communication.none:Silence",
     "commnet": "gacrl.networks.communication.commnet:CommNet",
     "dial": "gacrl.networks.communication.dial:Dial",
+    "told": "gacrl.networks.communication.told:Told",
+    "tarmac": "gacrl.networks.communication.tarmac:Tarmac",
+    "ic3net": "gacrl.networks.communication.ic3net:Ic3net",
     "discrete": "gacrl.networks.communication.symbols:DiscreteSymbols",
     "soft": "gacrl.networks.communication.symbols:SoftSymbols",
 }

@@ -62,7 +62,7 @@ def _algorithm(**changes: Any) -> Mapping[str, Any]:
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
         "no-graph": Part("layers over the observation vector in place of the entity graph", _network(torso="mlp")),
-        "no-messages": Part("zero rounds of messages", _network(communication="none")),
+        "no-messages": Part("zero rounds of messages", _network(communication="none", gate=False, word_price=0.0)),
         "soft-messages": Part("symbols softened, a continuous message", _network(communication="soft")),
         "no-latent": Part("symbols made of the agent's vector, without a code", _network(latent="none")),
         "plain-code": Part("a deterministic code", _network(latent="deterministic")),

@@ -156,7 +156,8 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
         opened.trainer.intervention,
     )
     conversations = env.num_symmetries if config.symmetric_play else 1
-    sent = conversations * network.rounds * float(np.log2(network.vocabulary))
+    choices = network.vocabulary + network.gate  # with a gate also to say nothing
+    sent = conversations * network.rounds * float(np.log2(choices))
     used = bits_used(heard)
     return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
 

@@ -158,7 +158,9 @@ def plan(config: RunConfig, out: Path) -> list[Planned]:
     wanted = _num_parameters(config)
     runs: list[Planned] = []
     for name in LEARNERS:
-        changes = {"communication": _KINDS[name], **({} if name == TALKING else {"parameters": wanted})}
+        changes: dict[str, Any] = {"communication": _KINDS[name]}
+        if name != TALKING:
+            changes |= {"parameters": wanted, "gate": False, "word_price": 0.0}  # what only symbols have
         changed = configuration.from_dict({"algorithm": {"network": changes}}, config)
         runs.append(Planned(name, changed, out / name))
     return runs

@@ -146,11 +146,11 @@ class AgentNetwork(eqx.Module):
         """Return the edges along which something arrives, and what each agent's network is given of them."""
         adjacency, sight = heard_adjacency(observation, self.radius), self.sight(observation)
         if self.nearest is None or self.nearest >= adjacency.shape[0]:
-            return adjacency, Neighbourhood(adjacency, sight, arrives=observation.arrives)
+            return adjacency, Neighbourhood(adjacency, sight, None, observation.arrives, observation.features)
         speakers = nearest_speakers(observation.positions, adjacency, self.nearest)
         near = jnp.take_along_axis(adjacency, speakers, axis=1)
         seen = jnp.take_along_axis(sight, speakers[..., None], axis=1)
-        return adjacency, Neighbourhood(near, seen, speakers, observation.arrives)
+        return adjacency, Neighbourhood(near, seen, speakers, observation.arrives, observation.features)
 
 
 def unroll(

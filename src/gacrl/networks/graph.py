@@ -73,3 +73,20 @@ def attend(values: Float[Array, "N M H"], score: Float[Array, "N M"]) -> Float[A
     largest = jax.lax.stop_gradient(jnp.max(score, axis=1, keepdims=True, initial=-1e9))
     weight = jnp.exp(score - largest)
     return jnp.einsum("nm,nmh->nh", weight, values) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)
+
+
+def attend_to_speakers(
+    values: Float[Array, "N M H"], score: Float[Array, "N M"], spoke: Float[Array, "N M"]
+) -> Float[Array, "N H"]:
+    """Return the same mean over those alone who spoke (1, else 0); 0 where nobody did.
+
+    The gradient of `spoke` is the value times the share that this speaker has, or would have. That of a softmax over
+    those who spoke would be 0 for a lone speaker, whose share is 1 in any case.
+    """
+    loud = jax.lax.stop_gradient(spoke)
+    largest = jnp.max(jnp.where(loud > 0, score, -jnp.inf), axis=1, keepdims=True, initial=-1e9)
+    # Of silent ones the score may be any number above the largest of those who spoke.
+    weight = jnp.exp(jnp.minimum(score - jax.lax.stop_gradient(largest), 20.0))
+    spoken = weight * loud
+    share = weight / jnp.maximum(spoken.sum(1, keepdims=True) - spoken + weight, 1e-9)
+    return jnp.einsum("nm,nmh->nh", share * spoke, values)

@@ -1,4 +1,4 @@
-"""Discrete messages: Gumbel-Softmax, and the noise it takes."""
+"""Discrete messages: Gumbel-Softmax, a gate of two values, and the noise they take."""
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,20 @@ def gumbel_softmax(
 def most_likely_symbol(logits: Float[Array, "*b V"], axis: int = -1) -> Float[Array, "*b V"]:
     """The one-hot of the largest entry: the message when nothing is explored."""
     return jax.nn.one_hot(logits.argmax(axis), logits.shape[axis], dtype=logits.dtype, axis=axis)
+
+
+def gumbel_sigmoid(
+    logits: Float[Array, "*b"], noise: Float[Array, "*b"] | None, temperature: Float[Array, ""] | float
+) -> Float[Array, "*b"]:
+    """Decide between 0 and 1: 1 where logits + logistic noise > 0, with the gradient of sigmoid((logits + noise) / τ).
+
+    It is the straight-through Gumbel-Softmax of two symbols, as the difference of two Gumbel numbers is logistic.
+    Without noise it is the likelier of the two.
+    """
+    if noise is not None:
+        logits = logits + noise
+    soft = jax.nn.sigmoid(logits / temperature)
+    return soft + jax.lax.stop_gradient((logits > 0).astype(soft.dtype) - soft)
 
 
 def normal_and_gumbel(

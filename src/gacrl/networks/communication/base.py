@@ -30,6 +30,13 @@ class Neighbourhood(NamedTuple):
     speakers: Int[Array, "N K"] | None = None
     """Who the speakers are; None: agents 0 to N − 1."""
     arrives: Arrives = Arrives()
+    features: Float[Array, "N O"] | None = None
+    """What each of the N agents sees, for a kind that says it as it is."""
+
+    def observed(self) -> Float[Array, "N O"]:
+        """Return what each of the N agents sees."""
+        assert self.features is not None
+        return self.features
 
     def hear(self, words: Float[Array, "N V"]) -> Float[Array, "N K V"]:
         """Return the words of each agent's speakers."""

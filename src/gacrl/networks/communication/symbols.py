@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
-from gacrl.networks.graph import attend, sighted, sighted_size
+from gacrl.networks.graph import attend, attend_to_speakers, sighted, sighted_size
 from gacrl.networks.layers import Linear, Mlp
-from gacrl.networks.messages import gumbel_softmax, most_likely_symbol
+from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
 from gacrl.types import PRNGKey
 
 
@@ -25,12 +25,18 @@ class Symbols(Communication):
     of later rounds of what it knows by then. An edge's embedding is of the symbol and of what the receiver itself sees
     of the speaker. Over the neighbours: the mean, weighted by attention (scaled dot product of the receiver's query
     and the edge's embedding).
+
+    With a gate an agent may say nothing in a round. Its word is then zeros, and whoever says zeros is not heard, as if
+    the edge were cut. A price makes each word that is said a loss of its speaker.
     """
 
     encode: tuple[Linear, ...]
     edge: tuple[Mlp, ...]
     query: tuple[Linear, ...]
     merge: tuple[Linear, ...]
+    gate: tuple[Linear, ...]
+    """Whether to speak, a layer for each round; () where every agent always does."""
+    word_price: float = eqx.field(static=True)
     noise: float = eqx.field(static=True)
     straight_through: bool = eqx.field(static=True)
     speaker_identity: bool = eqx.field(static=True)
@@ -47,6 +53,9 @@ class Symbols(Communication):
         self.edge = tuple(Mlp(known, (narrow,), k, gain) for k in edge)
         self.query = tuple(Linear(width, narrow, k, gain) for k in query)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
+        gate = jax.random.split(jax.random.fold_in(key, 1), config.rounds) if config.gate else ()
+        self.gate = tuple(Linear(i, 1, k, gain) for i, k in zip(sizes, gate, strict=False))
+        self.word_price = config.word_price
 
     def speak(
         self,
@@ -57,22 +66,37 @@ class Symbols(Communication):
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         known, said, entropy = [sighted(near.sight)], [], jnp.zeros(hidden.shape[0])
+        rounds = len(self.encode)
         if self.speaker_identity:
             known.append(near.who())
         for number, (encode, edge, query, merge) in enumerate(
             zip(self.encode, self.edge, self.query, self.merge, strict=True)
         ):
-            logits = encode(hidden if code is None or number else code)
+            meant = hidden if code is None or number else code
+            logits = encode(meant)
             log_symbol = jax.nn.log_softmax(logits)
-            entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / len(self.encode)
+            entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / rounds
             draw = None if key is None else jax.random.fold_in(key, number)
             said.append(self.symbol(logits, draw, temperature))
-            words = received(said[-1], near, number, len(self.encode))
+            if self.gate:
+                said[-1] *= self.spoke(meant, number, draw, temperature)
+            words = received(said[-1], near, number, rounds)
             edges_heard = edge(jnp.concatenate([words, *known], axis=-1))
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
-            heard = attend(edges_heard, jnp.where(near.adjacency, score, -jnp.inf))
+            heeded = edges_heard, jnp.where(near.adjacency, score, -jnp.inf)
+            heard = attend_to_speakers(*heeded, words.sum(-1)) if self.gate else attend(*heeded)
             hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
-        return Spoken(hidden, jnp.stack(said), (), entropy)
+        messages = jnp.stack(said)
+        price = self.word_price * messages.sum((0, 2)) if self.word_price else None
+        return Spoken(hidden, messages, (), entropy, price)
+
+    def spoke(
+        self, meant: Float[Array, "N M"], number: int, key: PRNGKey | None, temperature: Float[Array, ""] | float
+    ) -> Float[Array, "N 1"]:
+        """Return who says a word in a round, 1 or 0, with the gradient of a soft choice."""
+        logit = self.gate[number](meant)
+        noise = None if key is None else self.noise * jax.random.logistic(jax.random.fold_in(key, 1), logit.shape)
+        return gumbel_sigmoid(logit, noise, temperature)
 
     def drawn(self, key: PRNGKey, logits: Float[Array, "N V"]) -> Float[Array, "N V"]:
         """Draw the Gumbel noise of a round."""
