@@ -62,6 +62,8 @@ def complete(settings: Settings) -> bool:
     return False
 
 
+SILENT = "silent"
+"""Among a task's references, the best policy that is known to say nothing."""
 HEADLINE = "return_agent_mean"
 RETURN: Mapping[str, Metric] = MappingProxyType(
     {
