@@ -121,29 +121,30 @@ class Navigation(Environment):
             words=(action // MOVES).astype(jnp.int32) if self.utters else state.words,
             clock=state.clock + 1,
         )
-        distance = self._distance(state)
-        reward = self._reward(distance, params)
-        info = self._measured(reward, distance)
+        reward, info = self._score(state, params)
         reward = reward + params.goal_bonus * info[f"reached_{RADII[0]}"]
         truncated = state.clock >= self.max_cycles
         return state, TimeStep(self.observe(state), reward, jnp.zeros_like(truncated), truncated, info)
 
     def measure(self, state: NavigationState, params: NavigationParams) -> dict[str, Float[Array, ""]]:
         """Measure what `step` does, from where everything stands after it."""
-        distance = self._distance(state)
-        return self._measured(self._reward(distance, params), distance)
+        return self._score(state, params)[1]
 
-    def _measured(self, reward: Float[Array, " N"], distance: Float[Array, " N"]) -> dict[str, Float[Array, ""]]:
-        seeks = jnp.asarray(self.rules.seeks)
+    def _score(
+        self, state: NavigationState, params: NavigationParams
+    ) -> tuple[Float[Array, " N"], dict[str, Float[Array, ""]]]:
+        """Return MPE2's reward of each agent, and the measurements."""
+        distance, seeks = self._distance(state), jnp.asarray(self.rules.seeks)
+        lost = jnp.square(distance) if self.rules.squared else distance
+        reward = self._reward(lost, params.local_ratio)
         info = {"reward_raw": reward.mean(), "distance_goal": _mean(distance, seeks)}
         for radius in RADII:
             there = distance < float(radius)
             info |= {f"reached_{radius}": _mean(there, seeks), f"success_{radius}": (there | ~seeks).all() * 1.0}
-        return info
+        return reward, info
 
-    def _reward(self, distance: Float[Array, " N"], params: NavigationParams) -> Float[Array, " N"]:
+    def _reward(self, lost: Float[Array, " N"], local_ratio: Float[Array, ""] | float) -> Float[Array, " N"]:
         """MPE2's: an agent's own part is how far the one whose goal it knows is from it; all share the mean."""
-        lost, local_ratio = jnp.square(distance) if self.rules.squared else distance, params.local_ratio
         mean = _mean(lost, jnp.asarray(self.rules.seeks))
         known = lost[np.array(self.rules.knows)]
         return -(local_ratio * known + (1 - local_ratio) * mean)
