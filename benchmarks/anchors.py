@@ -24,7 +24,9 @@ HEARD = ("graph", "named")
 
 def measured(task: Task, settings: Any, who: str, episodes: int) -> dict[str, float]:
     """The metrics that tables have, and the standard error of the headline."""
-    played = {k: np.asarray(v) for k, v in references.scripted_episodes(who, task.name, settings, episodes).items()}
+    played = {
+        k: np.asarray(v) for k, v in references.scripted_episodes(who, task.name, settings, episodes).items()
+    }
     error = played[task.headline].std(ddof=1) / np.sqrt(episodes)
     means = {name: float(played[name].mean()) for name in task.shown(list(played))}
     return {name: round(value, 3) for name, value in {**means, "standard_error": float(error)}.items()}

@@ -174,7 +174,7 @@ class Task(NamedTuple):
             ) from error
 
     def _talk(self, settings: Settings) -> dict[str, float] | None:
-        """The headline of the best silent policy and of everybody told; None where the anchors are of other settings."""
+        """Return the headline of the best silent and of a told policy; None where the anchors are of other settings."""
         known = self.known()
         scale = {who: known.get("scores", {}).get(who) for who in (SILENT, TOLD)}
         anchored = known.get("settings", {})

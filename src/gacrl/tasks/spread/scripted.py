@@ -62,7 +62,7 @@ def silent(env: Scouts) -> Actor:
 
     def cost(to_posts: Float[Array, "N L"], posts: Float[Array, "L 2"], wanted: Bool[Array, " L"]) -> Array:
         _, between = pairwise_offsets(posts, posts)
-        left = jnp.minimum(to_posts, jnp.where(_pairs(wanted), between, jnp.inf).min(1))
+        left = jnp.minimum(to_posts, jnp.where(_pairs(wanted), between, jnp.inf).min(1)[None])
         return jnp.where(blind[:, None], left, WALKING * to_posts)
 
     planned = _planner(env, cost, blind)
@@ -81,7 +81,8 @@ def _planner(
 ) -> Actor:
     """Assign landmarks once an episode, and walk there. Memory: each agent's landmark [N].
 
-    cost: from each agent's distance to each post, the posts, and which want an agent of their own. stays: who goes nowhere.
+    cost: from each agent's distance to each post, the posts, and which want an agent of their own.
+    stays: who goes nowhere.
     """
     params = env.default_params()
 
