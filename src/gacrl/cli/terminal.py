@@ -311,8 +311,8 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
     if worth is not None:
         talk = scores["task"]["talk"]
         console.print(
-            f"talk       {worth['mean']:.2f} of the way from the best silent policy, {talk['silent']:.2f}, to one that is "
-            f"told everything, {talk['told']:.2f}",
+            f"talk       {worth['mean']:.2f} of the way from the best silent policy, {talk['silent']:.2f}, "
+            f"to one that is told everything, {talk['told']:.2f}",
             soft_wrap=True,
         )
     if "messages" in scores:
