@@ -146,7 +146,7 @@ def test_what_is_seen_thing_by_thing():
     goal = int(state.goals[1])
     np.testing.assert_allclose(things.own[:, 2:5], [np.eye(3)[goal], np.zeros(3)], atol=1e-6)
     np.testing.assert_array_equal(things.landmark_mask, [[False] * 3, [True] * 3])
-    np.testing.assert_allclose(things.landmarks[1], state.landmarks - state.positions[1], atol=1e-6)
+    np.testing.assert_allclose(things.landmarks[1], state.landmarks - state.positions[1][None], atol=1e-6)
     np.testing.assert_array_equal(features_of(things)[1], np.eye(3))
     assert things.agents.shape == (2, 0, 2)
 
@@ -159,7 +159,7 @@ def test_what_is_seen_thing_by_thing():
         assert marked.size == 1
         np.testing.assert_allclose(things.landmarks[agent, marked[0]], known, atol=1e-6)
     assert len({tuple(row) for row in np.asarray(state.order)}) > 1, "everyone has an order of its own"
-    others = state.positions[1:] - state.positions[0]
+    others = state.positions[1:] - state.positions[0][None]
     np.testing.assert_allclose(things.agents[0], others, atol=1e-6)
 
 
