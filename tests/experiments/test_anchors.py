@@ -58,6 +58,8 @@ def test_score_talk_is_0_in_silence_and_1_where_all_is_told():
         ("reference", {"max_cycles": 50}, False),
         ("scouts", {"num_agents": 5}, False),
         ("scouts", {"reward": "mpe2"}, True),
+        ("traffic_junction", {"arrival_start": 0.1}, True),
+        ("traffic_junction", {"vision": 1}, False),
     ],
 )
 def test_anchors_are_of_one_setting_of_the_task(name: str, changes: dict[str, object], has: bool):
