@@ -2,6 +2,7 @@
 
     python benchmarks/environment.py [--rounds 5] [--core 0] [--json]
     python benchmarks/environment.py --agents 3 10 30 100 300        # cost of a step against the size of the team
+    python benchmarks/environment.py --task reference speaker_listener   # other tasks, of ours and of JaxMARL's MPE
 
 Random actions, observations, rewards and the beginning of new episodes (25 steps) included. JaxMARL and this library
 run inside one compiled `lax.scan`, their actions drawn in the same program; VMAS in its own eager loop. Every step
@@ -23,6 +24,12 @@ SIZES = (1, 32, 1_024, 16_384)
 SECONDS = 0.3
 """Of a measurement, about."""
 HORIZON = 25
+JAXMARL = {
+    "spread": "MPE_simple_spread_v3",
+    "reference": "MPE_simple_reference_v3",
+    "speaker_listener": "MPE_simple_speaker_listener_v4",
+}
+"""Its names of our tasks. Those with utterances are played with utterance actions, as it has them."""
 
 
 def timed(run: Callable[[Any, int], Any], state: Any) -> Callable[[], float]:
@@ -59,18 +66,24 @@ def scanned(step: Callable[..., Any], draw: Callable[..., Any]) -> Callable[[Any
 
 
 @functools.cache
-def ours(num_envs: int, agents: int = 3, nearest: int | None = None) -> Callable[[], float]:
+def ours(num_envs: int, agents: int = 3, nearest: int | None = None, task: str = "spread") -> Callable[[], float]:
     import jax
     import jax.numpy as jnp
 
+    import gacrl
     from gacrl.envs import copies
-    from gacrl.tasks.spread.environment import Spread
 
-    env = Spread(agents, agents, num_agent_neighbors=nearest, num_landmark_neighbors=nearest)
+    size = {"num_agents": agents, "num_agent_neighbors": nearest, "num_landmark_neighbors": nearest}
+    env: Any = gacrl.make_env(task, **(size if task == "spread" else {"talk": "actions"}))
     params = env.default_params()
+    mask = env.reset(jax.random.key(0), params)[1].action_mask
+    possible = jnp.argsort(~mask, axis=1)  # of each agent, first what it can do
 
     def draw(key: Any, steps: int) -> Any:
-        return (jax.random.bits(key, (steps, num_envs, agents)) % 5).astype(jnp.int32)
+        drawn = jax.random.bits(key, (steps, num_envs, env.num_agents))
+        if task == "spread":
+            return (drawn % 5).astype(jnp.int32)
+        return possible[jnp.arange(env.num_agents), drawn % mask.sum(1)].astype(jnp.int32)
 
     def step(state: Any, total: Any, action: Any, key: Any) -> Any:
         state, observation, after = copies.step(env, params, state[0], action, key)
@@ -82,16 +95,18 @@ def ours(num_envs: int, agents: int = 3, nearest: int | None = None) -> Callable
 
 
 @functools.cache
-def jaxmarl(num_envs: int) -> Callable[[], float]:
+def jaxmarl(num_envs: int, task: str = "spread") -> Callable[[], float]:
     import jax
     import jax.numpy as jnp
     from jaxmarl import make
 
-    env = make("MPE_simple_spread_v3")
+    env = make(JAXMARL[task])
     agents = len(env.agents)
+    possible = jnp.array([env.action_spaces[name].n for name in env.agents])[:, None]
 
     def draw(key: Any, steps: int) -> Any:
-        return (jax.random.bits(key, (steps, agents, num_envs)) % 5).astype(jnp.int32)
+        drawn = jax.random.bits(key, (steps, agents, num_envs))
+        return (drawn % (5 if task == "spread" else possible)).astype(jnp.int32)
 
     def step(state: Any, total: Any, action: Any, key: Any) -> Any:
         actions = {name: action[i] for i, name in enumerate(env.agents)}
@@ -150,6 +165,26 @@ def compare(rounds: int, core: int) -> dict[str, dict[str, list[float]]]:
     return ratios
 
 
+def of_tasks(names: list[str], rounds: int, core: int) -> None:
+    """Environment steps a second of other tasks, here and in JaxMARL where it can be installed."""
+    python = peers.python_of("jaxmarl")
+    us = peers.Side("ours", sys.executable, __file__, core)
+    peer = None if python is None else peers.Side("jaxmarl", python, __file__, core)
+    for name in names:
+        for size in SIZES[:3]:
+            pairs = [
+                (side.ask(num_envs=size, task=name) if side else None)
+                for _ in range(rounds)
+                for side in (us, peer)
+            ]
+            mine, theirs = ([size / seconds for seconds in pairs[k::2] if seconds] for k in (0, 1))
+            beside = f", jaxmarl {peers.spread(theirs)}" if theirs else ""
+            print(f"{name:16} {size:6,} environments: ours {peers.spread(mine)} steps/s{beside}", flush=True)
+    for side in (us, peer):
+        if side is not None:
+            side.close()
+
+
 def against_team_size(sizes: list[int], core: int) -> None:
     """Microseconds of a step of one environment, seeing everyone and only the four nearest."""
     us = peers.Side("ours", sys.executable, __file__, core)
@@ -167,12 +202,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="turns of each side, per size")
     parser.add_argument("--core", type=int, default=0, help="the core that all sides are pinned to")
     parser.add_argument("--agents", type=int, nargs="+", help="instead: ours alone, against the number of agents")
+    parser.add_argument("--task", nargs="+", choices=JAXMARL, help="instead: these tasks, ours and JaxMARL's")
     parser.add_argument("--json", action="store_true", help="end with one line: {ratio: {peer: {size: value}}}")
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.serve:
         side = {"ours": ours, "jaxmarl": jaxmarl, "vmas": vmas}[asked.serve]
         peers.serve(lambda **request: side(**request)())
+    elif asked.task:
+        of_tasks(asked.task, asked.rounds, asked.core)
     elif asked.agents:
         against_team_size(asked.agents, asked.core)
     else:

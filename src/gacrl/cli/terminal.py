@@ -307,6 +307,14 @@ def print_evaluation(scores: dict[str, Any], console: Console | None = None) -> 
     for who, metrics in scores["references"].items():
         table.add_row(who, *[_cell(metrics.get(name), None, 3) for name in shown])
     console.print(table)
+    worth = scores["final"]["greedy"].get("score_talk")
+    if worth is not None:
+        talk = scores["task"]["talk"]
+        console.print(
+            f"talk       {worth['mean']:.2f} of the way from the best silent policy, {talk['silent']:.2f}, "
+            f"to one that is told everything, {talk['told']:.2f}",
+            soft_wrap=True,
+        )
     if "messages" in scores:
         bits = scores["messages"]
         console.print(

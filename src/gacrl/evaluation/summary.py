@@ -1,11 +1,13 @@
 """Numbers over seeds, and on the scale from random to the task's own reference."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy import special  # not scipy.stats: a run would start half a second later
+
+from gacrl.tasks.task import SILENT, TOLD
 
 CONFIDENCE = 0.95
 
@@ -48,21 +50,24 @@ def _one(values: np.ndarray) -> dict[str, Any]:
 def normalised(
     metrics: dict[str, dict[str, Any]],
     references: dict[str, dict[str, float]],
-    scale: Sequence[str] | None,
+    facts: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """The metrics, and for each a `score_` in which one reference is 0 and another is 1, where the two differ.
+    """Add to the metrics a `score_` of each, in which one reference is 0 and another is 1, where the two differ.
 
-    scale: their names; None: there are no scores.
+    facts: those of the task. Where they know a silent and a told policy, `score_talk` is the headline between the best
+    silent one, 0, and everybody told, 1.
     """
-    if scale is None:
-        return metrics
-    low, high = (references[name] for name in scale)
-
-    scores = {
-        f"score_{name}": _scaled(entry, low[name], high[name])
-        for name, entry in metrics.items()
-        if low[name] != high[name]
-    }
+    scores: dict[str, dict[str, Any]] = {}
+    if facts["scale"] is not None:
+        low, high = (references[name] for name in facts["scale"])
+        scores = {
+            f"score_{name}": _scaled(entry, low[name], high[name])
+            for name, entry in metrics.items()
+            if low[name] != high[name]
+        }
+    talk = facts.get("talk")
+    if talk is not None and talk[SILENT] != talk[TOLD]:
+        scores["score_talk"] = _scaled(metrics[facts["headline"]], talk[SILENT], talk[TOLD])
     return {**metrics, **scores}
 
 

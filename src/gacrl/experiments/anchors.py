@@ -1,11 +1,11 @@
 """What is known of a task before anybody learns it: scores of random, silent and told policies."""
 
-import json
 from typing import Any
 
 from gacrl import tasks
+from gacrl.tasks.task import SILENT, TOLD
 
-SCORED = ("random", "silent", "told")
+SCORED = ("random", SILENT, TOLD)
 """Whose scores a table of tasks has: uniformly random actions, the best policy without a word, and one that is told
 everything."""
 
@@ -13,9 +13,7 @@ everything."""
 def row(name: str) -> dict[str, Any]:
     """What must be done in a task, and the scores of its headline: None where nobody has measured one."""
     task = tasks.find(name)
-    known: dict[str, Any] = {}
-    if task.anchors is not None and task.anchors.exists():
-        known = json.loads(task.anchors.read_text(encoding="utf-8"))
+    known = task.known()
     scores = known.get("scores", {})
     return {
         "task": name,

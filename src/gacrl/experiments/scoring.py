@@ -91,7 +91,7 @@ def score_run(
         "horizon": int(played.env.max_cycles),
         "num_agents": int(played.env.num_agents),
         "task": facts,
-        "final": {kind: normalised(metrics, beside, facts["scale"]) for kind, metrics in final.items()},
+        "final": {kind: normalised(metrics, beside, facts) for kind, metrics in final.items()},
         "references": beside,
         **({} if messages is None else {"messages": messages}),
     }

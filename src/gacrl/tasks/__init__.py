@@ -20,6 +20,7 @@ DEFAULT = "spread"
 _OURS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
     {
         "spread": ("gacrl.tasks.spread", "SpreadSettings", "TASK"),
+        "scouts": ("gacrl.tasks.spread", "ScoutsSettings", "SCOUTS"),
         "speaker_listener": ("gacrl.tasks.navigation", "SpeakerListenerSettings", "SPEAKER_LISTENER"),
         "reference": ("gacrl.tasks.navigation", "ReferenceSettings", "REFERENCE"),
         "colours": ("gacrl.tasks.navigation", "ColoursSettings", "COLOURS"),
@@ -82,11 +83,12 @@ def default_settings(name: str) -> Any:
 
 def ours(settings: Any) -> tuple[str, Any] | None:
     """The name and settings of one of our tasks, from its settings or its environment; None for anything else."""
-    for name in _OURS:
-        kind = type(default_settings(name))
-        if isinstance(settings, kind):
-            return name, kind(**{field.name: getattr(settings, field.name) for field in fields(kind)})
-    return None
+    kinds = {name: type(default_settings(name)) for name in _OURS}
+    matching = [name for name, kind in kinds.items() if isinstance(settings, kind)]
+    if not matching:
+        return None
+    name = max(matching, key=lambda name: len(kinds[name].__mro__))  # one task may build on another's settings
+    return name, kinds[name](**{field.name: getattr(settings, field.name) for field in fields(kinds[name])})
 
 
 def flag(name: str) -> str:

@@ -3,6 +3,7 @@
 A leaf: it imports no jax, so that names, metrics and settings can be asked for at once.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -62,6 +63,8 @@ def complete(settings: Settings) -> bool:
     return False
 
 
+SILENT, TOLD = "silent", "told"
+"""Among a task's references and anchors: the best policy that says nothing, and one to which everything is told."""
 HEADLINE = "return_agent_mean"
 RETURN: Mapping[str, Metric] = MappingProxyType(
     {
@@ -94,7 +97,8 @@ class Task(NamedTuple):
     """Scripted policies (Environment -> Actor) beside random and noop. The first is 1 in every score, where random is
     0, and stands in the tables; the others are played by name."""
     anchors: Path | None = None
-    """A file of committed scores: of silent and of told policies, with command, seeds and settings."""
+    """A JSON file of committed scores of the headline: {scores: {random, silent, told}, settings, …} and where each is
+    from. The scores are those of a task with these settings."""
     needs_memory: bool = False
     """What was seen or heard at earlier steps must be remembered."""
     scene: Callable[[Settings, EnvState, EnvParams], Any] | None = None
@@ -154,4 +158,25 @@ class Task(NamedTuple):
             "lower_is_better": [name for name, metric in known.items() if not metric.higher_is_better],
             "defined_by": {name: list(metric.defined_by) for name, metric in known.items() if metric.defined_by},
             "comparable": {name: getattr(settings, name) for name in names},
+            "talk": self._talk(settings),
         }
+
+    def known(self) -> dict[str, Any]:
+        """Read the anchors; nothing where there are none. Raises ConfigError for a damaged file."""
+        if self.anchors is None or not self.anchors.exists():
+            return {}
+        try:
+            known = json.loads(self.anchors.read_text(encoding="utf-8"))
+            return {**known, "scores": {**known["scores"]}, "settings": {**known.get("settings", {})}}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"{self.anchors}, the anchors of {self.name}, must be a JSON object with scores: {error}"
+            ) from error
+
+    def _talk(self, settings: Settings) -> dict[str, float] | None:
+        """Return the headline of the best silent and of a told policy; None where the anchors are of other settings."""
+        known = self.known()
+        scale = {who: known.get("scores", {}).get(who) for who in (SILENT, TOLD)}
+        anchored = known.get("settings", {})
+        same = all(getattr(settings, name, None) == value for name, value in anchored.items())
+        return scale if anchored and same and None not in scale.values() else None  # pyright: ignore[reportReturnType]

@@ -257,7 +257,7 @@ def _finish(
         "env_steps": env_steps,
         "final": {
             kind: normalised(
-                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references, facts["scale"]
+                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references, facts
             )
             for kind, values in final.items()
         },

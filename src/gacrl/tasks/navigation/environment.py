@@ -126,6 +126,19 @@ class Navigation(Environment):
             words=(action // MOVES).astype(jnp.int32) if self.utters else state.words,
             clock=state.clock + 1,
         )
+        reward, info = self._score(state, params)
+        reward = reward + params.goal_bonus * info[f"reached_{RADII[0]}"]
+        truncated = state.clock >= self.max_cycles
+        return state, TimeStep(self.observe(state), reward, jnp.zeros_like(truncated), truncated, info)
+
+    def measure(self, state: NavigationState, params: NavigationParams) -> dict[str, Float[Array, ""]]:
+        """Measure what `step` does, from where everything stands after it."""
+        return self._score(state, params)[1]
+
+    def _score(
+        self, state: NavigationState, params: NavigationParams
+    ) -> tuple[Float[Array, " N"], dict[str, Float[Array, ""]]]:
+        """Return MPE2's reward of each agent, and the measurements."""
         distance, seeks = self._distance(state), jnp.asarray(self.rules.seeks)
         lost = jnp.square(distance) if self.rules.squared else distance
         reward = self._reward(lost, params.local_ratio)
@@ -133,9 +146,7 @@ class Navigation(Environment):
         for radius in RADII:
             there = distance < float(radius)
             info |= {f"reached_{radius}": _mean(there, seeks), f"success_{radius}": (there | ~seeks).all() * 1.0}
-        reward = reward + params.goal_bonus * info[f"reached_{RADII[0]}"]
-        truncated = state.clock >= self.max_cycles
-        return state, TimeStep(self.observe(state), reward, jnp.zeros_like(truncated), truncated, info)
+        return reward, info
 
     def _reward(self, lost: Float[Array, " N"], local_ratio: Float[Array, ""] | float) -> Float[Array, " N"]:
         """MPE2's: an agent's own part is how far the one whose goal it knows is from it; all share the mean."""

@@ -123,8 +123,8 @@ class ColoursSettings:
     tell a place."""
     max_cycles: int = 25
     """Steps of an episode."""
-    talk: Literal["messages"] = "messages"
-    """Symbols that arrive in the same step."""
+    talk: Talk = "messages"
+    """Symbols that arrive in the same step; this task has no utterance actions."""
     goal_bonus: float = 1.0
     """What a step on the own goal (within 0.1) adds to what is learned from; not in the metrics."""
     identity: bool = True

@@ -16,7 +16,7 @@ REFERENCE = Task(
     make=make,
     metrics=METRICS,
     progress="reached_0.2",
-    references={"told": told, "centroid": centroid},
+    references={"told": told, "silent": centroid},
     anchors=ANCHORS / "reference.json",
     scene=scene,
     comparable=("max_cycles",),
@@ -34,7 +34,7 @@ COLOURS = REFERENCE._replace(
     name="colours",
     settings=ColoursSettings,
     anchors=ANCHORS / "colours.json",
-    references={"told": told, "centroid": centroid, "guess": guess},
+    references={"told": told, "silent": centroid, "guess": guess},
     comparable=("num_agents", "num_landmarks", "graph", "named", "max_cycles"),
     summary="agents in a ring: each must stand on a landmark that only the one before it knows",
 )

@@ -12,12 +12,14 @@ Physics and arena scale, which no observation tells, they take from the environm
 velocities of agents and landmarks from the observation.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.envs.particles import DIRECTIONS, Physics, coast, pairwise_offsets
+from gacrl.envs.particles import DIRECTIONS, Physics, along, coast, pairwise_offsets
 from gacrl.tasks.spread.assignment import assign
 from gacrl.tasks.spread.environment import (
     CAPTURE_RADIUS,
@@ -27,6 +29,7 @@ from gacrl.tasks.spread.environment import (
     reflect,
     unpack_state,
 )
+from gacrl.tasks.spread.scouts import Scouts
 from gacrl.types import Actor, Decision, Memory, Observation, PRNGKey
 
 SIGHT = 5
@@ -38,12 +41,49 @@ SHARED_DISTANCE = 0.17
 """Landmarks this close get one agent, midway: it covers both, where two agents would push each other off."""
 SHIFT = 0.95 * CAPTURE_RADIUS
 """How far a target may move off its landmark and still be sure to cover it."""
+WALKING = 0.2
+"""What a unit of way costs, as a share of a unit that a landmark stays uncovered, where not all can be covered."""
 ELBOW_ROOM = 0.02
 """Agents keep this far apart, disc to disc, unless it costs them as much in distance to their targets."""
 
 
 def oracle(env: Spread) -> Actor:
     """Memory: each agent's landmark [N], fixed from the episode's first step on."""
+    return _planner(env, lambda to_posts, posts, wanted: jnp.square(to_posts), None)
+
+
+def silent(env: Scouts) -> Actor:
+    """Make the blind stay where they are, while those who see cover the landmarks that are worth it.
+
+    A landmark that is left to a blind agent costs its distance to the nearest thing that will stand: that agent, or the
+    agent of another landmark.
+    """
+    blind = jnp.asarray(env.blind)
+
+    def cost(to_posts: Float[Array, "N L"], posts: Float[Array, "L 2"], wanted: Bool[Array, " L"]) -> Array:
+        _, between = pairwise_offsets(posts, posts)
+        left = jnp.minimum(to_posts, jnp.where(_pairs(wanted), between, jnp.inf).min(1)[None])
+        return jnp.where(blind[:, None], left, WALKING * to_posts)
+
+    planned = _planner(env, cost, blind)
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
+        decision, memory = planned.policy(memory, observation, key)
+        return decision._replace(action=jnp.where(along(blind, decision.action), 0, decision.action)), memory
+
+    return Actor(policy, planned.initial_memory)
+
+
+def _planner(
+    env: Spread,
+    cost: Callable[[Float[Array, "N L"], Float[Array, "L 2"], Bool[Array, " L"]], Float[Array, "N L"]],
+    stays: Bool[Array, " N"] | None,
+) -> Actor:
+    """Assign landmarks once an episode, and walk there. Memory: each agent's landmark [N].
+
+    cost: from each agent's distance to each post, the posts, and which want an agent of their own.
+    stays: who goes nowhere.
+    """
     params = env.default_params()
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
@@ -56,15 +96,16 @@ def oracle(env: Spread) -> Actor:
         def assign_agents(memory: Int[Array, " N"]) -> Int[Array, " N"]:
             origins = state.positions[:, None]
             meeting = jax.vmap(_intercept, (0, None, None, None))(origins, posts, motion, params)
-            squares = jnp.square(_length(meeting - origins))
+            costs = cost(_length(meeting - origins), posts, wanted)
             possible = (agents & (memory == UNASSIGNED))[:, None] & wanted[None, :]
-            return assign(jnp.where(possible, squares, jnp.inf))
+            return assign(jnp.where(possible, costs, jnp.inf))
 
         # A loop that runs once at most: mapped over environments, `cond` would assign in every step and select.
         # The body depends on the memory, because XLA moves constant work out, in front of the loop.
         landmark = lax.while_loop(lambda memory: (memory == UNASSIGNED).any(), assign_agents, memory)
 
         free = ~(agents & (landmark >= 0) & wanted[landmark])
+        free = free if stays is None else free | stays
         coasting, _ = coast(state.positions, state.velocities, params.physics)
         target = _intercept(coasting, posts[landmark], motion[landmark], params)
         return Decision(_steer(env, state, agents, target, free)), landmark

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias
 
-from gacrl.config.checks import between, take_types
+from gacrl.config.checks import between, require, take_types
 from gacrl.tasks.task import Metric
 
 RewardKind: TypeAlias = Literal["mpe2", "paper", "coverage", "potential"]
@@ -92,6 +92,29 @@ class SpreadSettings:
         return None if self.reset_on_collision == "off" else self.reset_distance
 
 
+@dataclass(frozen=True)
+class ScoutsSettings(SpreadSettings):
+    """The same, where some agents see no landmarks: the others must tell them where to go."""
+
+    reward: RewardKind = "coverage"
+    """What the learner earns; see `spread`. Metrics are always of MPE2's."""
+    num_blind: int = 1
+    """So many agents, the first ones, see no landmarks."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        between("env", self, 1, 10_000, "num_blind")
+        require(
+            self.num_blind < self.num_agents,
+            f"env.num_blind must be below env.num_agents, {self.num_agents}, not {self.num_blind}: somebody must see",
+        )
+
+    @property
+    def blind(self) -> tuple[bool, ...]:
+        """Who sees no landmarks."""
+        return tuple(agent < self.num_blind for agent in range(self.num_agents))
+
+
 COMPARABLE = (
     *("num_agents", "landmarks", "arena_scale", "landmark_speed", "terminate_on_success"),
     *("reset_on_collision", "resets_within"),
@@ -123,4 +146,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions": Metric("collisions", "sum", "touching pairs", False, "collisions"),
         "near_agents": Metric("near_agents", "mean", "agents", False),
     }
+)
+
+SCOUTS_METRICS: Mapping[str, Metric] = MappingProxyType(
+    {**METRICS, "success_final_0.2": Metric("success_0.2", "last", label="within 0.2")}
 )

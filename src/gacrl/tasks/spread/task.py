@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.checks import require
+from gacrl.tasks.spread import scouts
 from gacrl.tasks.spread.environment import Spread, SpreadParams, params_of
 from gacrl.tasks.spread.scene import scene
-from gacrl.tasks.spread.scripted import local, oracle
-from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SpreadSettings
+from gacrl.tasks.spread.scripted import local, oracle, silent
+from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SCOUTS_METRICS, ScoutsSettings, SpreadSettings
 from gacrl.tasks.task import Part, Task, Words
 
 
@@ -77,11 +78,23 @@ TASK = Task(
     metrics=METRICS,
     progress="coverage_0.2",
     references={"oracle": oracle, "local": local},
-    anchors=Path(__file__).with_name("anchors.json"),
+    anchors=Path(__file__).with_name("anchors") / "spread.json",
     scene=scene,
     comparable=COMPARABLE,
     ragged=ragged,
     words=Words(mark="landmark", lit="covered"),
     parts={"no-coverage-bonus": Part("MPE2's reward alone", {"env": {"reward": "mpe2"}})},
     summary="agents must cover landmarks without touching each other (MPE2 simple_spread_v3)",
+)
+
+SCOUTS = TASK._replace(
+    name="scouts",
+    settings=ScoutsSettings,
+    make=scouts.make,
+    metrics=SCOUTS_METRICS,
+    references={"told": oracle, "silent": silent},
+    anchors=Path(__file__).with_name("anchors") / "scouts.json",
+    scene=scouts.scene,
+    comparable=(*COMPARABLE, "num_blind"),
+    summary="spread where one agent sees no landmarks: the others must tell it where to go",
 )
