@@ -68,38 +68,49 @@ def gif(
     words: what the task calls the things in it. Raises OSError where the file cannot be written, ValueError without
     episodes, for one without a scene, or for an impossible size or speed.
     """
-    if not episodes:
-        raise ValueError("a GIF needs at least one episode")
-    if not 0 < fps <= 50:
-        raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
-    every = -(-sum(episode.num_steps + 1 for episode in episodes) // _SAMPLES)
-
-    def drawn(step: int = 1) -> Iterator[Image.Image]:
-        """Every `step`-th frame of all episodes."""
-        moment = 0
-        for k, episode in enumerate(episodes, 1):
-            note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
-            picture = _Picture(episode, size, title, note, words)
-            for t in range(episode.num_steps + 1):
-                if moment % step == 0:
-                    yield picture.draw(t)
-                moment += 1
-
+    pauses = durations(episodes, fps)
     with written_whole(path) as file:
-        palette = _palette(drawn(every))
-        frames = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn())
+        palette = _palette(drawn(episodes, size, title, words, -(-len(pauses) // _SAMPLES)))
+        frames = drawn(episodes, size, title, words)
+        quantized = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in frames)
         colours = palette.getpalette() or []
-        next(frames).save(
+        next(quantized).save(
             file,
             format="GIF",
             save_all=True,
-            append_images=frames,
-            duration=[pause for episode in episodes for pause in _durations(episode.num_steps, fps)],
+            append_images=quantized,
+            duration=pauses,
             loop=0,
             palette=bytes([*colours, 0, 0, 0]),
             transparency=len(colours) // 3,  # a pixel that stays as it was
             optimize=True,
         )
+
+
+def drawn(
+    episodes: Sequence[Episode], size: int, title: str = "", words: Words = WORDS, step: int = 1
+) -> Iterator[Image.Image]:
+    """Draw every `step`-th frame of the episodes, one after the other."""
+    moment = 0
+    for k, episode in enumerate(episodes, 1):
+        note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
+        picture = _Picture(episode, size, title, note, words)
+        for t in range(episode.num_steps + 1):
+            if moment % step == 0:
+                yield picture.draw(t)
+            moment += 1
+
+
+def durations(episodes: Sequence[Episode], fps: int | float) -> list[int]:
+    """Return for how many milliseconds each frame of the episodes is seen.
+
+    Raises ValueError without episodes, or for an impossible speed.
+    """
+    if not episodes:
+        raise ValueError("a picture needs at least one episode")
+    if not 0 < fps <= 50:
+        raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
+    return [pause for episode in episodes for pause in _durations(episode.num_steps, fps)]
 
 
 def frame(episode: Episode, t: int, size: int = 480, title: str = "", words: Words = WORDS) -> Image.Image:

@@ -180,6 +180,13 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
 DEFAULT_PRESET = "gacrl"
 
 
+def label(config: RunConfig) -> str:
+    """Return what a run of these settings is called: as its preset, or as its algorithm where it has another one."""
+    known = PRESETS.get(config.preset)
+    same = known is None or known[1].algorithm.name == config.algorithm.name
+    return config.preset if same else config.algorithm.name
+
+
 def preset(name: str = DEFAULT_PRESET) -> RunConfig:
     """Return the settings of a preset. Raises ConfigError with the nearest name for one there is not."""
     if name not in PRESETS:

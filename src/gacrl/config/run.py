@@ -79,9 +79,9 @@ class RunConfig:
     preset: str = "gacrl"
     """The preset that this started from."""
     seed: int = 0
-    """Seed of the first member."""
+    """The random seed; of several, the first."""
     num_seeds: int = 1
-    """Members: independent runs with the seeds seed, seed + 1, …"""
+    """Independent trainings side by side, with the seeds seed, seed + 1, …"""
 
     def __post_init__(self) -> None:
         between("run", self, 0, 2**31 - 1, "seed")

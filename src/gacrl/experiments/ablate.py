@@ -155,7 +155,7 @@ def ablate(
     asked = {"config": configuration.to_dict(config)}
     claim_folder(out, "ablate.json", asked, "ablation", lambda held: "another ablation: choose another --out")
     refuse_other_settings([run for run in runs if run.name != YOKED])  # its settings come from a run
-    watch.planned([run.name for run in runs])
+    watch.planned({run.name: parts_of(config)[run.name].says if run.name != FULL else "" for run in runs})
     if not train_missing(runs[:1], watch):
         return None
     because = why_diverged(runs[0].folder)

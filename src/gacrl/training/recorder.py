@@ -12,9 +12,13 @@ from filelock import FileLock, Timeout
 
 from gacrl import tasks
 from gacrl.config import files as configuration
+from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.versions import version
+
+SHOWN_EPISODES = 4
+"""Episodes that a run keeps, and shows in its GIF."""
 
 
 class RunFolder:
@@ -42,7 +46,7 @@ class RunFolder:
         configuration.from_dict(configuration.to_dict(config))  # refuses now what could not be loaded again
         try:
             if path is None:
-                path = _next_free(Path("runs"), config.preset)
+                path = _next_free(Path("runs"), label(config))
             elif path.exists() and (not path.is_dir() or any(path.iterdir())):
                 mend = f", or continue it with `gacrl resume {path}`" if _is_run(path) else ""
                 raise UserError(f"{path} exists and is not overwritten: choose another --out{mend}")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from gacrl import render, tasks
 from gacrl.config import files as configuration
+from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.evaluation import episodes, references
@@ -23,15 +24,12 @@ from gacrl.training.devices import anyone, gathered, leads, one_seed, same_every
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, train
-from gacrl.training.recorder import RunFolder
+from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
 from gacrl.versions import versions
-
-SHOWN_EPISODES = 4
-"""Episodes that a run keeps, and shows in its GIF."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +277,7 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
     for number, episode in enumerate(shown):
         episode.save(folder.episodes / f"{number}.npz")
     if shown and shown[0].scene is not None:
-        title = f"{config.preset}, seed {config.seed}"
+        title = f"{label(config)}, seed {config.seed}"
         render.gif(shown, folder.gif, title=title, words=task.words)
 
 
