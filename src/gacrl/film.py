@@ -6,6 +6,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 
 from gacrl import render
@@ -74,7 +75,7 @@ def _mp4(episodes: Sequence[Episode], path: Path, size: int, title: str, words: 
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said) as ffmpeg:
             assert ffmpeg.stdin is not None
             try:
-                for picture, count in zip([first, *frames], times, strict=True):
+                for picture, count in zip(chain([first], frames), times, strict=True):
                     for _ in range(count):
                         ffmpeg.stdin.write(picture.tobytes())
                 ffmpeg.stdin.close()

@@ -68,16 +68,16 @@ def main(words: Sequence[str] | None = None) -> int:
         output.prepare()
     words = list(map(_at_home, sys.argv[1:] if words is None else words))
     try:
-        code = _answer(words)
-        if sys.stdout is not None:
-            sys.stdout.flush()  # a disk that is full shows here, and not when Python ends
-        return code
+        try:
+            return _answer(words)
+        finally:
+            output.finish()
     except UserError as error:
         print(f"gacrl: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        name = f" {error.filename}" if error.filename else ""
-        print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
+        what = f"cannot use {error.filename}" if error.filename else "cannot read or write"
+        print(f"gacrl: {what}: {reason(error)}", file=sys.stderr)
         return 2
     except RuntimeError as error:  # JAX's own; its class would have to be imported
         if "RESOURCE_EXHAUSTED" not in str(error):

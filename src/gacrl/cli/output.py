@@ -1,27 +1,10 @@
 """The output streams: whatever letters they can show, and whether or not anybody still reads them."""
 
-import codecs
 import io
 import sys
-import unicodedata
 from typing import Any
 
-_PLAIN = {
-    **dict.fromkeys("─━╌═—–−", "-"),
-    **dict.fromkeys("│┃║", "|"),
-    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼╵╷", "+"),
-    **dict.fromkeys("“”„", '"'),
-    **dict.fromkeys("‘’", "'"),
-    "×": "x",
-    "±": "+/-",
-    "→": "->",
-    "…": "...",
-    "·": "*",
-    "∞": "infinity",
-    "ß": "ss",
-}
-_GREEK = ("GREEK SMALL LETTER ", "GREEK CAPITAL LETTER ")
-_ERRORS = "gacrl-plain"
+from gacrl.report.letters import PLAIN_LETTERS
 
 
 def prepare() -> None:
@@ -30,20 +13,47 @@ def prepare() -> None:
     A letter that the stream's encoding has not is written in plain ones. What is printed after the reader has gone, as
     `head` does, goes nowhere, and the command does its work to the end.
     """
-    codecs.register_error(_ERRORS, _in_plain_letters)
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if isinstance(stream, io.TextIOWrapper) and isinstance(getattr(stream.buffer, "raw", None), io.FileIO):
+        if isinstance(stream, io.TextIOWrapper) and isinstance(_raw(stream), io.FileIO):
             stream.flush()
-            raw = io.BufferedWriter(_Unread(stream.fileno(), "w", closefd=False))
-            lines = stream.line_buffering or stream.isatty()
-            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, _ERRORS, line_buffering=lines))
+            file: Any = _Unread(stream.fileno(), "w", closefd=False)
+            file = file if _raw(stream) is stream.buffer else io.BufferedWriter(file)  # the former with python -u
+            setattr(
+                sys,
+                name,
+                io.TextIOWrapper(
+                    file,
+                    stream.encoding,
+                    PLAIN_LETTERS,
+                    line_buffering=stream.line_buffering,
+                    write_through=stream.write_through,
+                ),
+            )
+
+
+def finish() -> None:
+    """Write what is still held back. Raises OSError where some of it could not be written, as on a full disk."""
+    if sys.stdout is None:
+        return
+    sys.stdout.flush()
+    raw = _raw(sys.stdout) if isinstance(sys.stdout, io.TextIOWrapper) else None
+    if isinstance(raw, _Unread) and raw.failed is not None:
+        error, raw.failed = raw.failed, None
+        raise OSError(error.errno, error.strerror, "standard output")
+
+
+def _raw(stream: io.TextIOWrapper) -> Any:
+    """The file under a stream and its buffer, where it has one."""
+    return getattr(stream.buffer, "raw", stream.buffer)
 
 
 class _Unread(io.FileIO):
-    """A file that takes everything after its reader has gone. Another error is raised once."""
+    """A file that takes everything, also after its reader has gone: no work is lost for want of somebody who looks."""
 
     _gone = False
+    failed: OSError | None = None
+    """Why it could not be written, except that its reader has gone."""
 
     def write(self, data: Any, /) -> int:
         if not self._gone:
@@ -51,27 +61,6 @@ class _Unread(io.FileIO):
                 return super().write(data)
             except BrokenPipeError:
                 self._gone = True
-            except OSError:
-                self._gone = True
-                raise
+            except OSError as error:
+                self._gone, self.failed = True, error
         return memoryview(data).nbytes
-
-
-def _in_plain_letters(error: UnicodeError) -> tuple[Any, int]:
-    """For `codecs`: plain letters in place of those that cannot be encoded; bytes of a file's name as they are."""
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    letters = error.object[error.start : error.end]
-    if all("\udc80" <= letter <= "\udcff" for letter in letters):
-        return bytes(ord(letter) - 0xDC00 for letter in letters), error.end
-    return "".join(map(_plain, letters)), error.end
-
-
-def _plain(letter: str) -> str:
-    if letter in _PLAIN:
-        return _PLAIN[letter]
-    name = unicodedata.name(letter, "")
-    for greek in _GREEK:
-        if name.startswith(greek):
-            return name.removeprefix(greek).partition(" ")[0].lower()
-    return unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode() or "?"

@@ -1,7 +1,6 @@
 """What the terminal shows: a header, a live line (or a line per evaluation), and tables at the end."""
 
 import math
-import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -13,7 +12,6 @@ from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
 
-from gacrl import tasks
 from gacrl.cli import stopwatch
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
@@ -23,7 +21,7 @@ from gacrl.training.build import Plan
 from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.footprint import readable
 from gacrl.training.loop import Progress
-from gacrl.training.recorder import RunFolder
+from gacrl.training.recorder import RunFolder, resuming
 from gacrl.training.session import Ended
 from gacrl.training.watching import Watcher
 
@@ -117,13 +115,14 @@ class TerminalWatcher:
         if self.quiet:
             return
         if run.summary is None:
-            again = f"gacrl resume {shlex.quote(str(run.folder))}{tasks.flag(run.config.task)}"
+            again = resuming(run.folder, run.config.task)
             self._print_whole(f"stopped at environment step {run.env_steps:,}; go on with: {again}")
             return
         print_evaluation({"run": str(run.folder), **run.summary}, self._console)
         self._paper_tables(run)
         self._print(
-            f"pace       {run.summary['steps_per_second']:,.0f} training steps/s; {run.summary['compile_seconds']:.1f} s compiling"
+            f"pace       {run.summary['steps_per_second']:,.0f} training steps/s, "
+            f"{run.summary['compile_seconds']:.1f} s compiling"
         )
         self._print_whole(f"summary    {run.folder / 'summary.json'}")
         picture = run.folder / "episodes.gif"
@@ -213,7 +212,8 @@ class RunsWatcher:
             told += f" in {duration(self._line.seconds)}" + (
                 f", {self._line.reached}" if self._line.reached else ""
             )
-        self._print(f"{told}; {self._left()}" if self._seconds else told)
+        more = self._seconds and len(self._over) < len(self._names)
+        self._print(f"{told}; {self._left()}" if more else told)
 
     def say(self, sentence: str) -> None:
         """Print something that belongs to no run."""
@@ -225,12 +225,13 @@ class RunsWatcher:
         line = self._line = _Line(name)
         self._live.update(line)
         self._printed = -math.inf
-        what = f" ({self._names[name]})" if self._names.get(name) else ""
+        if self._names.get(name):
+            self._print(f"{self._place(name)}{name}: {self._names[name]}")
 
         def tell(how: str) -> None:
             line.text = f"{self._place(name)}{name}: {how}"
             if not self._alive:
-                self._print(f"{self._place(name)}{name}{what}: {how}")
+                self._print(line.text)
 
         def progress(progress: Progress) -> None:
             line.fraction, line.reached = progress.env_steps / progress.total_env_steps, reached(progress)

@@ -77,7 +77,7 @@ class RunConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     preset: str = "gacrl"
-    """The preset that this started from."""
+    """The preset that these settings start from (`gacrl presets`)."""
     seed: int = 0
     """The random seed; of several, the first."""
     num_seeds: int = 1

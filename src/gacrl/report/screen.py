@@ -1,6 +1,6 @@
 """Text and tables for a terminal of any width: what does not fit is folded, and a number is never cut.
 
-A leaf: it imports Rich, and that only for tables.
+It imports Rich only for tables.
 """
 
 import os
@@ -11,6 +11,8 @@ import textwrap
 import time
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
+
+from gacrl.report.letters import in_letters_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -95,6 +97,8 @@ def print_table(
     """
     if title:
         screen.print(title, soft_wrap=True)
+    columns = [in_letters_of(screen.encoding, caption) for caption in columns]
+    rows = [[in_letters_of(screen.encoding, cell) for cell in row] for row in rows]
     whole = _fits(screen, columns, rows)
     folds = [range(len(columns))] if whole else _folds(screen, columns, rows, keys)
     for fold in folds:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,7 +49,7 @@ class RunFolder:
             if path is None:
                 path = _next_free(Path("runs"), label(config))
             elif path.exists() and (not path.is_dir() or any(path.iterdir())):
-                mend = f", or continue it with `gacrl resume {path}`" if _is_run(path) else ""
+                mend = f", or continue it with `{resuming(path)}`" if _is_run(path) else ""
                 raise UserError(f"{path} exists and is not overwritten: choose another --out{mend}")
             else:
                 path.mkdir(parents=True, exist_ok=True)
@@ -206,6 +207,11 @@ class RunFolder:
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
+
+
+def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
+    """The command that goes on with a run, to copy: whatever its folder is called."""
+    return f"gacrl resume {shlex.quote(str(path))}{tasks.flag(task)}"
 
 
 def _origin(config: RunConfig, begun_from: str | None) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from gacrl.training.devices import anyone, gathered, leads, one_seed, same_every
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, train
-from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
+from gacrl.training.recorder import SHOWN_EPISODES, RunFolder, resuming
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
@@ -164,7 +164,7 @@ def _run(
     begun: TrainState | None = None,
 ) -> Ended:
     """begun: the state to begin with, stacked, where it is not a fresh one."""
-    again = tasks.flag(config.task)
+    again = resuming(folder.path, config.task)
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
     try:
@@ -197,17 +197,15 @@ def _run(
         if leads():
             folder.write_diverged(str(error).partition(";")[0])
         raise Diverged(
-            f"{error}, or see the first bad update with `gacrl resume {folder.path}{again} --diagnose`, which begins "
+            f"{error}, or see the first bad update with `{again} --diagnose`, which begins "
             f"at {'the start' if env_steps == 0 else f'the last good checkpoint, of environment step {env_steps}'}"
         ) from error
     except Faulty as error:
-        raise Faulty(
-            f"{error}, then go on with `gacrl resume {folder.path}{again}` from environment step {env_steps}"
-        ) from error
+        raise Faulty(f"{error}, then go on with `{again}` from environment step {env_steps}") from error
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.path}: {reason(error)}; make room there or allow writing, "
-            f"then `gacrl resume {folder.path}{again}` goes on from the last checkpoint"
+            f"then `{again}` goes on from the last checkpoint"
         ) from error
     return Ended(folder.path, config, env_steps, summary)
 

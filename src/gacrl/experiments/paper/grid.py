@@ -158,7 +158,10 @@ def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | No
     scores = _train_missing(grid, trainer, members, out, say, finals)
     means = {point: float(np.mean([scores[Member(point, seed)] for seed in grid.seeds])) for point in grid.points}
     winner = max(means, key=lambda point: means[point])
-    say(f"best: {winner}; trained again on fresh seeds beside the paper's choice")
+    say(
+        f"best: {winner} (ε₀: share of random actions at the start, τ₀: temperature of messages at the start); trained "
+        "again on fresh seeds beside the paper's choice"
+    )
     finalists = list(dict.fromkeys([winner, grid.choice]))
     again = [Member(point, seed) for point in finalists for seed in grid.fresh_seeds]
     scores = _train_missing(grid, trainer, again, out, say)
