@@ -356,8 +356,8 @@ def _worths(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
     page.text(
         "The probability that a seed with all parts ends with a better value than one without this one. One may say "
         "that a part helps where it is .95 or more, its interval lies above .5, and there are 10 seeds; fewer "
-        f"indicate. Detectable: the smallest difference of mean {task.headline} that so many seeds would show in 80 % of all "
-        "repetitions."
+        f"indicate. Detectable: the smallest difference of mean {task.headline} that so many seeds would show in 80 % "
+        "of all repetitions."
     )
 
 
