@@ -51,7 +51,7 @@ def say(screen: "Console", line: str) -> None:
     screen.print(folded(line, screen.width) if knows_width else line, soft_wrap=True)
 
 
-def duration(seconds: float) -> str:
+def duration(seconds: int | float) -> str:
     """Write a time in words: 7 s, 12 min, 3.5 h; a question mark for one that nobody knows yet."""
     if seconds != seconds:
         return "?"
@@ -72,10 +72,10 @@ def folded(text: str, width: int) -> str:
 class Pace:
     """How long what is left will take, where every part takes as long as those before did."""
 
-    def __init__(self, parts: float) -> None:
+    def __init__(self, parts: int | float) -> None:
         self._parts, self._begun = parts, time.monotonic()
 
-    def left(self, done: float) -> str:
+    def left(self, done: int | float) -> str:
         """Write the time to the end, after so many parts of them: "12 min left", or nothing before anything is done."""
         took = time.monotonic() - self._begun
         return f"{duration(took / done * (self._parts - done))} left" if done > 0 else ""
