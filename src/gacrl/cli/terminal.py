@@ -16,13 +16,13 @@ from gacrl.cli import stopwatch
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.report.screen import Pace, console, duration, print_table, say
-from gacrl.tasks.task import HEADLINE
 from gacrl.training.build import Plan
 from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.footprint import readable
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder, resuming
 from gacrl.training.session import Ended
+from gacrl.training.telling import reached, standing
 from gacrl.training.watching import Watcher
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class TerminalWatcher:
 
     def _progress(self, progress: Progress) -> None:
         """A line for each evaluation stays; the live line says what goes on."""
-        self._print(describe(progress))
+        self._print(standing(progress))
         self._line.text = f"training, {duration(progress.seconds_left)} left"
         self._line.fraction = progress.env_steps / progress.total_env_steps
 
@@ -235,7 +235,7 @@ class RunsWatcher:
 
         def progress(progress: Progress) -> None:
             line.fraction, line.reached = progress.env_steps / progress.total_env_steps, reached(progress)
-            line.text = f"{self._place(name)}{name}: {describe(progress)}; {self._left(progress.seconds_left)}"
+            line.text = f"{self._place(name)}{name}: {standing(progress)}; {self._left(progress.seconds_left)}"
             if time.monotonic() >= self._printed + _SECONDS_BETWEEN_LINES:
                 self._print(line.text)
                 self._printed = time.monotonic()
@@ -285,29 +285,8 @@ class _Line:
         return Text.assemble(spinning, line) if isinstance(spinning, Text) else line
 
 
-_ON_A_LINE = 2
-"""Metrics of the progress line."""
 _SECONDS_BETWEEN_LINES = 10.0
 """Of the progress lines of one run among several."""
-
-
-def describe(progress: Progress) -> str:
-    """Write in one line where a run stands: what its greedy evaluation reached, its pace, and the time to its end."""
-    done = progress.rows[0]["episodes_done"]
-    episodes = f"episode {done:,}" if done else "no episode has ended"
-    return (
-        f"step {progress.env_steps:,} of {progress.total_env_steps:,}, {episodes}: {reached(progress)}; "
-        f"{progress.clock.steps_per_second:,.0f} steps/s, {duration(progress.seconds_left)} left"
-    )
-
-
-def reached(progress: Progress) -> str:
-    """Write what a greedy evaluation reached, as the closing table does: headline first, return, means over seeds."""
-    rows, headline = progress.rows, next(iter(progress.shown), HEADLINE)
-    names = [name for name in dict.fromkeys((headline, HEADLINE, *progress.shown)) if name in rows[0]["greedy"]]
-    means = {name: sum(row["greedy"][name] for row in rows) / len(rows) for name in names[:_ON_A_LINE]}
-    told = [f"{progress.shown.get(name, 'return')} = {_cell(mean, digits=3)}" for name, mean in means.items()]
-    return f"greedy {', '.join(told)}" + (f" (mean of {len(rows)} seeds)" if len(rows) > 1 else "")
 
 
 def print_evaluation(scores: dict[str, Any], screen: Console | None = None) -> None:
