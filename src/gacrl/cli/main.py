@@ -333,7 +333,7 @@ def _changes(asked: "Evaluate | Render", rest: list[str], command: str) -> Calla
                 raise UserError(f"the task has no setting {name}: leave {flag} out")
         with contextlib.ExitStack() as called:
             for flag, (name, _) in asked_for.items():
-                called.enter_context(_called(flag, f"env.{name}"))
+                called.enter_context(_called(flag, f"--env.{name.replace('_', '-')}"))
             flags = [word for name, value in asked_for.values() for word in (f"--env.{name}", str(value))]
             return parsing.changed(settings, [*rest, *flags], command, type(asked))
 

@@ -126,7 +126,24 @@ class _Shown(io.StringIO):
 
 
 def _parsed(kind: Any, words: list[str], command: str, default: Any) -> Any:
-    """The arguments, and the words that are none of theirs."""
+    """The arguments, and the words that are none of theirs. What is out of range is called by its flag."""
+    try:
+        return _understood(kind, words, command, default)
+    except UserError as error:
+        raise type(error)(_by_flag(str(error), words)) from None
+
+
+def _by_flag(sentence: str, words: list[str]) -> str:
+    """The sentence about a setting, with the flag in its place where the words set it."""
+    for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+        setting = flag.removeprefix("--").replace("-", "_")
+        for name in (setting, f"run.{setting}"):
+            if sentence.startswith(f"{name} "):
+                return flag + sentence.removeprefix(name)
+    return sentence
+
+
+def _understood(kind: Any, words: list[str], command: str, default: Any) -> Any:
     given: dict[str, Any] = {} if default is None else {"default": default}
     said, shown = io.StringIO(), _Shown(sys.stdout)
     try:
