@@ -23,7 +23,7 @@ RoundOfWords: TypeAlias = Float[Array, "E N V"]
 def silence(agents: Sequence[int] | None = None) -> Intervention:
     """Nobody hears these agents, counted from 0; by default nobody hears anybody."""
 
-    def init(words: Words) -> Any:
+    def init(words: Any) -> Any:
         _require_agents("silence", agents or (), words)
         return ()
 
@@ -40,7 +40,7 @@ def silence(agents: Sequence[int] | None = None) -> Intervention:
 def swap(one: int, other: int) -> Intervention:
     """Each of the two agents is heard with the words of the other."""
 
-    def init(words: Words) -> Any:
+    def init(words: Any) -> Any:
         _require_agents("swap", (one, other), words)
         return ()
 
@@ -57,7 +57,7 @@ def scramble() -> Intervention:
     ConfigError for a single episode.
     """
 
-    def init(words: Words) -> Any:
+    def init(words: Any) -> Any:
         require(words.shape[0] > 1, "to scramble messages takes at least two episodes side by side")
         return ()
 
@@ -102,7 +102,7 @@ def delay(steps: int) -> Intervention:
     fits = steps == int(steps) and 1 <= steps <= 1_000
     require(fits, f"delay must be a whole number of steps between 1 and 1000, not {steps!r}")
 
-    def init(words: Words) -> _Late:
+    def init(words: Any) -> _Late:
         return _Late(jnp.zeros((steps, *words.shape)), jnp.zeros(words.shape[0], jnp.int32))
 
     def arrives(state: _Late, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -206,12 +206,12 @@ def _shape(ask: Ask) -> tuple[int, int, int, int]:
     return jax.eval_shape(ask, Arrives()).shape
 
 
-def _require_agents(name: str, agents: Sequence[int], words: Words) -> None:
+def _require_agents(name: str, agents: Sequence[int], words: Any) -> None:
     num_agents = words.shape[2]
     for agent in agents:
         require(
             0 <= agent < num_agents,
-            f"there is no agent {agent} to {name}: they are counted from 0 to {num_agents - 1}",
+            f"{name}: there are the agents 0 to {num_agents - 1}, and no agent {agent}",
         )
 
 
