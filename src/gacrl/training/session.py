@@ -19,7 +19,14 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
-from gacrl.training.build import evaluated_settings, make_trainer, member_shapes, plan, stacked_shapes
+from gacrl.training.build import (
+    evaluated_settings,
+    learner_shapes,
+    make_trainer,
+    member_shapes,
+    plan,
+    stacked_shapes,
+)
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
@@ -281,6 +288,6 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
 
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
-    shapes = trainer.algorithm.acting(stacked_shapes(trainer).learner)
+    shapes = trainer.algorithm.acting(learner_shapes(trainer))
     learners = checkpoint.load(found, shapes, prefix=".learner")
     return shard_seeds(learners, trainer.mesh)
