@@ -146,6 +146,8 @@ class Intervention(NamedTuple):
     for a team it does not fit."""
     follow: Callable[[Any, Words, Bool[Array, " E"]], Any] = lambda state, said, first: state
     """(state, what was said, first) -> what it carries on."""
+    told: str = ""
+    """What it does, in words that stand beside results."""
 
 
 Learner: TypeAlias = Any

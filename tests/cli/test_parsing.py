@@ -18,6 +18,9 @@ COMMANDS = {
 }
 
 
+MESSAGES = {"--silence", "--scramble", "--drop", "--delay"}
+
+
 def train(*words: str, preset: str = "gacrl") -> arguments.Train:
     base = arguments.Train(arguments.Settings.of(presets.preset(preset)))
     return parsing.parse(arguments.Train, list(words), "train", default=base)
@@ -81,7 +84,10 @@ def test_flags_are_those_of_help(capsys: pytest.CaptureFixture[str]):
         main(["evaluate", "--help"])
     said = capsys.readouterr().out
     flags = parsing._flags(arguments.Evaluate, None)
-    assert set(flags) == {"--episodes", "--horizon", "--backend", "--num-agents", "--json", "--env", "--use"}
+    assert (
+        set(flags)
+        == {"--episodes", "--horizon", "--backend", "--num-agents", "--json", "--env", "--use"} | MESSAGES
+    )
     assert all(flag in said for flag in flags)
     known = parsing._flags(arguments.Train, arguments.Train(arguments.Settings.of(presets.preset("ippo"))))
     assert {"--from", "--algorithm.network.width", "--env.max-cycles", "--seed", "--coordinator"} <= set(known)
@@ -103,3 +109,24 @@ def test_the_nearest_setting_of_a_file_is_found_by_its_synonym():
     assert nearest("--eps", ["--algorithm.clip-eps", "--algorithm.epsilon"]) == "--algorithm.epsilon"
     assert nearest("--eps", ["--algorithm.clip-eps", "--env-steps"]) == "--algorithm.clip-eps"
     assert nearest("--zzz", ["--json"]) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ([], ""),
+        (["--silence"], "silence"),
+        (["--silence", "0", "2", "--horizon", "5"], "silence 0 2"),
+        (["--silence", "none"], ""),
+        (["--scramble"], "scramble"),
+        (["--drop", ".25"], "drop 0.25"),
+        (["--drop", "0"], "drop 0.0"),
+        (["--delay", "1e1"], "delay 10"),
+    ],
+)
+@pytest.mark.parametrize("kind", [arguments.Evaluate, arguments.Render])
+def test_what_happens_to_messages_is_one_flag(
+    kind: type[arguments.Evaluate | arguments.Render], words: list[str], text: str
+):
+    asked, rest = parsing.parse_known(kind, ["runs/x", *words], kind.__name__.lower())
+    assert (asked.messages.words(), rest) == (text, [])

@@ -46,6 +46,37 @@ class Outside:
     """A Python file to run first: it adds messages, exploration rules or algorithms (examples/)."""
 
 
+@dataclass(frozen=True)
+class Messages:
+    """What happens to the policy's messages on their way: at most one of these. Scripted policies say nothing."""
+
+    silence: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="[AGENT …]")] = None
+    """Nobody hears these agents, counted from 0; without a number, nobody hears anybody."""
+    scramble: bool = False
+    """Every agent is heard with its words from another of the episodes: as many, and about nothing that goes on."""
+    drop: Annotated[float | None, tyro.conf.arg(metavar="P")] = None
+    """Each edge loses its messages in a step with this probability."""
+    delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
+    """Words arrive this many steps late; in an episode's first steps nothing arrives."""
+
+    def words(self) -> str:
+        """Write it as the setting `training.intervention`; nothing where no flag is given.
+
+        Raises UserError where there are several.
+        """
+        asked = {
+            "silence": self.silence,
+            "scramble": () if self.scramble else None,
+            "drop": None if self.drop is None else (self.drop,),
+            "delay": None if self.delay is None else (self.delay,),
+        }
+        given = {name: values for name, values in asked.items() if values is not None}
+        if len(given) > 1:
+            raise UserError(f"one thing at a time can be done to messages, not --{' and --'.join(given)}")
+        return "".join(" ".join((name, *map(str, values))) for name, values in given.items())
+
+
+MESSAGES = Annotated[Messages, tyro.conf.arg(name="")]
 ON_TASK = Annotated[Outside, tyro.conf.arg(name="")]
 
 
@@ -133,6 +164,7 @@ class Evaluate:
       gacrl evaluate runs/paper-1
       gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
       gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
+      gacrl evaluate runs/gacrl-1 --silence 0 2       what are the messages of these two agents worth?
     """
 
     run: tyro.conf.Positional[str]
@@ -145,6 +177,7 @@ class Evaluate:
     """Our environment, or the real MPE2."""
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
+    messages: MESSAGES = Messages()
     outside: ON_TASK = Outside()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -160,6 +193,7 @@ class Render:
       gacrl render runs/paper-1 --out paper.gif
       gacrl render runs/paper-1 --out paper.mp4
       gacrl render oracle --out oracle.gif --episodes 2
+      gacrl render runs/gacrl-1 --silence --out silent.gif
     """
 
     run: tyro.conf.Positional[str]
@@ -172,6 +206,7 @@ class Render:
     """Steps of an episode (short for --env.max-cycles); none: as many as in training, or the task's own."""
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
+    messages: MESSAGES = Messages()
     outside: ON_TASK = Outside()
     sampled: bool = False
     """Explore as in training, instead of playing greedily."""

@@ -23,7 +23,7 @@ from gacrl.errors import UserError, reason
 from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
-    from gacrl.cli.arguments import Cluster, Evaluate, Render, Resume, Sweep
+    from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume, Sweep
     from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.paper.reproduce import Reproduction
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from gacrl.experiments.study import Watch
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
+    from gacrl.types import Intervention
 
 OVERVIEW = """\
 gacrl: learning to coordinate by communicating over a graph
@@ -340,6 +341,16 @@ def _changes(asked: "Evaluate | Render", rest: list[str], command: str) -> Calla
     return change
 
 
+def _intervention(asked: "Messages") -> "Intervention | None":
+    """What the flags do to messages."""
+    from gacrl.messages import interventions
+
+    words = asked.words()
+    name = words.partition(" ")[0]
+    with _called(f"--{name} must", f"{name} must"):
+        return interventions.parse(words)
+
+
 def _evaluate(words: _Words) -> int:
     from gacrl.cli import arguments, parsing
 
@@ -359,6 +370,7 @@ def _evaluate(words: _Words) -> int:
         backend=asked.backend,
         warn=_warn,
         task=words.task or tasks.DEFAULT,
+        intervention=_intervention(asked.messages),
     )
     print_evaluation(scores)
     if asked.json:
@@ -386,13 +398,16 @@ def _render(words: _Words) -> int:
 
     film.require_format(asked.out)
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
-    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task)
+    happens = _intervention(asked.messages)
+    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
     if shown.episodes[0].scene is None:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )
-    film.write(shown.episodes, asked.out, size=asked.size, title=asked.run, words=shown.task.words)
-    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}")
+    told = "" if shown.intervention is None else shown.intervention.told
+    title = f"{told}: {asked.run}" if told else asked.run
+    film.write(shown.episodes, asked.out, size=asked.size, title=title, words=shown.task.words)
+    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}" + (f"; {told}" if told else ""))
     return 0
 
 

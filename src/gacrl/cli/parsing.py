@@ -67,6 +67,14 @@ def _number(text: str) -> float:
         raise ValueError(f"must be a number, not {text}") from None
 
 
+def _numbers(words: list[str]) -> tuple[int, ...] | None:
+    """Read whole numbers, or `none`; behind a flag that takes any number of them, other words are easily caught."""
+    try:
+        return None if words == [_NONE] else tuple(map(whole_number, words))
+    except ValueError as error:
+        raise ValueError(f"{error}; other words stand before it") from None
+
+
 _VALUES: dict[Any, tuple[str, Callable[[str], Any]]] = {
     int: ("N", whole_number),
     float: ("X", _number),
@@ -105,6 +113,18 @@ def _registry() -> ConstructorRegistry:
             instance_from_str=lambda words: None if words[0].lower() == _NONE else read(words[0]),
             is_instance=lambda value: value is None or isinstance(value, inner[0]),
             str_from_instance=lambda value: [_NONE if value is None else str(value)],
+        )
+
+    @registry.primitive_rule
+    def several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:  # pyright: ignore[reportUnusedFunction]
+        if info.type != tuple[int, ...] | None:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="[N …]",
+            instance_from_str=_numbers,
+            is_instance=lambda value: value is None or isinstance(value, tuple),
+            str_from_instance=lambda value: [_NONE] if value is None else list(map(str, value)),
         )
 
     return registry

@@ -294,6 +294,7 @@ def print_evaluation(scores: dict[str, Any], screen: Console | None = None) -> N
     screen = console() if screen is None else screen
     shown: dict[str, str] = scores["task"]["shown"]
     title = f"{scores['run']}: {scores['episodes']} episodes of {scores['horizon']} steps"
+    title += f"; {scores['intervention']}" if "intervention" in scores else ""
     if any(metrics[next(iter(shown))]["interval"] for metrics in scores["final"].values()):
         title += "; mean over seeds ± half the 95 % interval"
     rows: list[list[str]] = []

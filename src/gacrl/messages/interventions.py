@@ -34,7 +34,8 @@ def silence(agents: Sequence[int] | None = None) -> Intervention:
             muted = jnp.zeros(num_agents, bool).at[jnp.asarray(agents, int)].set(True)
         return Arrives(kept=jnp.broadcast_to(~muted, (num_envs, num_agents, num_agents)))
 
-    return Intervention("silence", arrives, init)
+    heard = "nobody hears anybody" if agents is None else f"nobody hears {_named(agents)}"
+    return Intervention("silence", arrives, init, told=heard)
 
 
 def swap(one: int, other: int) -> Intervention:
@@ -47,7 +48,8 @@ def swap(one: int, other: int) -> Intervention:
     def swapped(said: RoundOfWords) -> RoundOfWords:
         return said.at[:, (one, other)].set(said[:, (other, one)])
 
-    return Intervention("swap", _round_by_round(swapped), init)
+    told = f"{_named((one, other))} are heard with each other's words"
+    return Intervention("swap", _round_by_round(swapped), init, told=told)
 
 
 def scramble() -> Intervention:
@@ -61,7 +63,8 @@ def scramble() -> Intervention:
         require(words.shape[0] > 1, "to scramble messages takes at least two episodes side by side")
         return ()
 
-    return Intervention("scramble", _round_by_round(lambda said: jnp.roll(said, 1, axis=0)), init)
+    moved = _round_by_round(lambda said: jnp.roll(said, 1, axis=0))
+    return Intervention("scramble", moved, init, told="every agent is heard with its words from another episode")
 
 
 def drop(probability: float) -> Intervention:
@@ -72,7 +75,9 @@ def drop(probability: float) -> Intervention:
         num_envs, _, num_agents, _ = _shape(ask)
         return Arrives(kept=jax.random.bernoulli(key, 1.0 - probability, (num_envs, num_agents, num_agents)))
 
-    return Intervention("drop", arrives)
+    return Intervention(
+        "drop", arrives, told=f"each edge loses its messages in {100 * probability:g} % of the steps"
+    )
 
 
 def noise(probability: float) -> Intervention:
@@ -85,7 +90,7 @@ def noise(probability: float) -> Intervention:
         random = jax.random.randint(symbol_key, words, 0, symbols)
         return Arrives(jax.nn.one_hot(random, symbols), jax.random.bernoulli(replaced_key, probability, words))
 
-    return Intervention("noise", arrives)
+    return Intervention("noise", arrives, told=f"{100 * probability:g} % of the words are replaced by random ones")
 
 
 class _Late(NamedTuple):
@@ -114,7 +119,8 @@ def delay(steps: int) -> Intervention:
     def follow(state: _Late, said: Words, first: Bool[Array, " E"]) -> _Late:
         return _Late(jnp.concatenate([said[None], state.words[:-1]]), jnp.where(first, 0, state.step) + 1)
 
-    return Intervention("delay", arrives, init, follow)
+    late = f"words arrive {steps} step{'s' * (steps > 1)} late"
+    return Intervention("delay", arrives, init, follow, late)
 
 
 INTERVENTIONS: dict[str, tuple[Callable[..., Intervention], str]] = {
@@ -166,7 +172,7 @@ def arriving(what: Arrives) -> Intervention:
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (first.shape[0], *leaf.shape)), what)
 
-    return Intervention("replace", arrives)
+    return Intervention("replace", arrives, told="the same words arrive at every step")
 
 
 def example(text: str, words: Callable[[], tuple[int, ...] | None]) -> Arrives:
@@ -204,6 +210,12 @@ def _round_by_round(change: Callable[[RoundOfWords], RoundOfWords]) -> Callable[
 def _shape(ask: Ask) -> tuple[int, int, int, int]:
     """[E, R, N, V]; nothing is computed."""
     return jax.eval_shape(ask, Arrives()).shape
+
+
+def _named(agents: Sequence[int]) -> str:
+    """Write agents in words: agent 0; agents 0, 1 and 2."""
+    *others, last = map(str, agents)
+    return f"agents {', '.join(others)} and {last}" if others else f"agent {last}"
 
 
 def _require_agents(name: str, agents: Sequence[int], words: Any) -> None:
