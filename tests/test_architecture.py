@@ -29,6 +29,7 @@ LAYERS = (
     ("rollout",),
     ("evaluation",),
     ("adapters", "messages", "render"),
+    ("film",),
     ("training",),
     ("experiments", "play", "api"),
     ("cli", "doctor"),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gacrl.cli import arguments
+from gacrl.cli import arguments, parsing
 from gacrl.cli import main as cli
 
 ROOT = Path(__file__).parent.parent
@@ -30,13 +30,13 @@ def commands(text: str) -> list[list[str]]:
 
 @pytest.fixture
 def only_parsed(from_outside: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    parse = arguments._parsed
+    parse = parsing._parsed
 
     def stop(*given: Any, **named: Any) -> None:
         parse(*given, **named)
         raise Understood
 
-    monkeypatch.setattr(arguments, "_parsed", stop)
+    monkeypatch.setattr(parsing, "_parsed", stop)
     monkeypatch.chdir(ROOT)  # the examples are named from there
 
 

@@ -1,8 +1,9 @@
 """Does this machine work? Devices, the physics beside the installed MPE2, and what algorithms learn."""
 
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -47,24 +48,43 @@ class Finding(NamedTuple):
     detail: str
 
 
-def examine() -> Iterator[Finding]:
-    """Look at one thing after the other; none of it takes longer than half a minute."""
-    found = versions()
-    yield Finding("versions", True, ", ".join(f"{name} {version}" for name, version in found.items()))
-    devices = jax.local_devices()
-    yield Finding("devices", True, f"{len(devices)} × {devices[0].device_kind} on {platform.machine()}")
-    yield _same_world()
+class Check(NamedTuple):
+    """One thing to look at."""
+
+    what: str
+    work: float
+    """How long it takes beside the others."""
+    look: Callable[[], Iterator[Finding]]
+
+
+def checks() -> list[Check]:
+    """List what there is to look at, the quickest first; none of it takes longer than half a minute."""
+    found = [
+        Check("versions", 0.0, _versions),
+        Check("devices", 0.0, _devices),
+        Check("the environment beside MPE2's", 1.0, _same_world),
+    ]
     seen: list[Trial] = []
     for name in presets.PRESETS:
         if name.startswith("graph-"):  # learners of the others; what they see more shows only in space
             continue
         asked = trial(presets.preset(name).algorithm)
         if asked not in seen:  # presets may differ by their task alone
-            yield from _learns(name, asked)
+            found.append(Check(f"{name} on the probes", 1.0, partial(_learns, name, asked)))
         seen.append(asked)
+    return found
 
 
-def _same_world() -> Finding:
+def _versions() -> Iterator[Finding]:
+    yield Finding("versions", True, ", ".join(f"{name} {version}" for name, version in versions().items()))
+
+
+def _devices() -> Iterator[Finding]:
+    devices = jax.local_devices()
+    yield Finding("devices", True, f"{len(devices)} × {devices[0].device_kind} on {platform.machine()}")
+
+
+def _same_world() -> Iterator[Finding]:
     """The oracle's return in our environment and in the real MPE2, on each one's own starts."""
     task = tasks.find(tasks.DEFAULT)
     env = task.make(tasks.default_settings(tasks.DEFAULT))
@@ -75,7 +95,7 @@ def _same_world() -> Finding:
     here, there = np.asarray(ours["return_agent_mean"]), theirs["return_agent_mean"]
     error = np.hypot(here.std(), there.std()) / np.sqrt(episodes)
     apart = abs(here.mean() - there.mean())
-    return Finding(
+    yield Finding(
         "environment",
         bool(apart < 4 * error),
         f"the oracle's return is {here.mean():.2f} here and {there.mean():.2f} in MPE2 "

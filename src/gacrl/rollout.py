@@ -74,7 +74,9 @@ def say(policy: Policy, carry: Carry, keys: Key[Array, " E"], arrives: Arrives) 
 def spoken(decision: Decision) -> Words:
     """Return what was said. Raises ConfigError where the policy says nothing."""
     if decision.messages is None:
-        raise ConfigError("the agents say nothing: there are no messages to intervene in")
+        raise ConfigError(
+            "the agents say nothing: there are no messages to intervene in; leave the intervention out"
+        )
     return decision.messages
 
 

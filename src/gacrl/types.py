@@ -142,10 +142,13 @@ class Intervention(NamedTuple):
     arrives: Callable[[Any, Callable[[Arrives], Words], Bool[Array, " E"], PRNGKey], Arrives]
     """(state, say, first, key) -> what arrives in this step. `say` asks the agents what they say if this arrives;
     `first` marks environments that begin an episode."""
-    init: Callable[[Words], Any] = lambda words: ()
-    """What it carries from step to step, for words of this shape. Raises ConfigError for a team it does not fit."""
+    init: Callable[[Any], Any] = lambda words: ()
+    """What it carries from step to step, for words of this shape: an array, or jax.ShapeDtypeStruct. Raises ConfigError
+    for a team it does not fit."""
     follow: Callable[[Any, Words, Bool[Array, " E"]], Any] = lambda state, said, first: state
     """(state, what was said, first) -> what it carries on."""
+    told: str = ""
+    """What it does, in words that stand beside results."""
 
 
 Learner: TypeAlias = Any

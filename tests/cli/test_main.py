@@ -6,6 +6,7 @@ All of it runs in one process on one tiny run; with xdist, on one worker.
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -105,19 +106,39 @@ def flip_a_byte(path: Path) -> None:
         ("evaluate random --episodse 2", "--episodse", "did you mean --episodes?"),
         ("presets --nonsense", "--nonsense", "gacrl presets --help"),
         ("doctor now", "now", "gacrl doctor --help"),
-        ("train --seed", "'--seed'", "gacrl train --help"),
-        ("evaluate", "run", "gacrl evaluate --help"),
-        ("train --env.num-agents 0", "env.num_agents must be between 1 and 10000, not 0", "gacrl train --help"),
+        ("train --seed", "--seed needs a value", "gacrl train --help"),
+        ("evaluate", "gacrl evaluate needs a RUN", "gacrl evaluate --help"),
+        ("evaluate random --arena-scale 0", "--env.arena-scale must be between 0.001", "evaluate --help"),
+        ("train --env.num-agents 0", "--env.num-agents must be between 1 and 10000, not 0", "gacrl train --help"),
         ("train --env.num-agents three", "--env.num-agents", "gacrl train --help"),
-        ("train --env-steps many", "--env-steps", "gacrl train --help"),
+        ("train --env-steps many", "--env-steps must be a whole number, not many", "gacrl train --help"),
+        ("train --env-steps 1.5e0", "--env-steps must be a whole number, not 1.5e0", "gacrl train --help"),
+        ("train --seed 1e400", "--seed must be smaller than 1e400", "gacrl train --help"),
+        ("sweep paper-grid --seeds 1e-1", "--seeds must be a whole number, not 1e-1", "gacrl sweep --help"),
+        ("train --wait soon", "--wait must be a number, not soon", "gacrl train --help"),
+        ("train --algorithm.lr 1e-3", "--algorithm.lr", "did you mean --algorithm.learning-rate?"),
+        ("train --lr 1e-3", "--lr", "did you mean --algorithm.learning-rate?"),
+        ("train --algorithm.eps 1", "--algorithm.eps", "did you mean --algorithm.epsilon?"),
+        ("train --preset ippo --algorithm.clip 1", "--algorithm.clip", "did you mean --algorithm.clip-eps?"),
+        ("train --preset ippo --ent 1", "--ent", "did you mean --algorithm.ent-coef?"),
+        ("train --discount 1", "--discount", "did you mean --algorithm.gamma?"),
+        ("train --gamma 1", "--gamma", "did you mean --algorithm.gamma?"),
+        ("train --n_envs 1", "--n_envs", "did you mean --training.num-envs?"),
+        ("train --n-steps 1", "--n-steps", "did you mean --training.num-steps?"),
+        ("train --algorithm.bs 1", "--algorithm.bs", "did you mean --algorithm.batch-size?"),
+        ("evaluate random --n-agents 3", "--n-agents", "did you mean --num-agents?"),
+        ("train gacrl", "unexpected word 'gacrl'", "did you mean --preset gacrl?"),
+        ("config paper", "unexpected word 'paper'", "did you mean --preset paper?"),
+        ("ablate gacrl-112k", "unexpected word 'gacrl-112k'", "did you mean --preset gacrl-112k?"),
         ("train --env.reward mpe", "'mpe'", "('mpe2', 'paper', 'coverage', 'potential')"),
         ("train --preset paper --algorithm.encoder-hidden a", "--algorithm.encoder-hidden", "gacrl train --help"),
-        ("train --algorithm.learning-rate nan", "algorithm.learning_rate", "between 0 and 1"),
+        ("train --algorithm.learning-rate nan", "--algorithm.learning-rate", "between 0 and 1"),
         ("train --preset paper --algorithm.epsilon 0.9", "algorithm.epsilon", "must not exceed 1"),
-        ("train --num-seeds 0", "num_seeds", "between 1 and 10000"),
+        ("train --num-seeds 0", "--num-seeds must", "between 1 and 10000"),
         ("train --seed -1", "seed", "between 0 and 2147483647"),
-        ("train --env-steps 0", "training.env_steps", "at least 1|between 1 and"),
-        ("train --episodes 0", "training.env_steps", "at least 1|between 1 and"),
+        ("train --env-steps 0", "--env-steps must be at least 1, not 0", "at least"),
+        ("train --env-steps 1e13", "--env-steps must be between 1 and 1e+12, not 10000000000000", "between"),
+        ("train --episodes 0", "--episodes must be at least 1, not 0", "at least"),
         ("train --episodes 1 --env-steps 9", "--env-steps and --episodes", "give one of them"),
         (
             "train --preset paper --env.continuous-actions",
@@ -140,14 +161,17 @@ def flip_a_byte(path: Path) -> None:
         ("evaluate nowhere", "there is no run nowhere", "gacrl train"),
         ("evaluate nowhere@1", "there is no run nowhere", "gacrl train"),
         ("evaluate random --episodes 0", "--episodes", "at least 1"),
-        ("evaluate random --horizon 0", "env.max_cycles", "between 1 and"),
-        ("evaluate random --num-agents 0", "env.num_agents", "between 1 and"),
-        ("evaluate random --arena-scale nan", "env.arena_scale", "between 0.001 and"),
+        ("evaluate random --horizon 0", "--horizon must be between 1 and 1000000, not 0", "evaluate --help"),
+        ("render random --horizon 0", "--horizon must be between 1 and 1000000, not 0", "render --help"),
+        ("evaluate random --num-agents 0", "--num-agents must be between 1 and 10000, not 0", "evaluate --help"),
+        ("evaluate random --arena-scale nan", "--env.arena-scale", "between 0.001 and"),
         ("evaluate random --backend mpe", "'mpe'", "'mpe2'"),
         ("evaluate random --backend mpe2 --arena-scale 2", "arena scale of 2", "--backend jax"),
         ("render random --episodes 0", "--episodes", "between 1 and 100"),
         ("render random --size 5000", "--size", "between 120 and 4096"),
         ("render random --out no/folder.gif", "no folder no", "folder.gif"),
+        ("render random --out film.avi", "cannot write AVI", ".gif or, with ffmpeg installed, in .mp4"),
+        ("render random --out film", "film: its name does not say what to write", ".gif or"),
     ],
 )
 def test_a_mistake_ends_in_one_sentence(
@@ -335,7 +359,15 @@ def test_training_leaves_what_it_says(tiny_run: TinyRun):
     lines = said.splitlines()
     assert f"run        {folder}" in lines, "a path is not broken over lines"
     assert f"summary    {folder / 'summary.json'}" in lines
-    assert sum(line.startswith("episode ") and "steps/s" in line for line in lines) == 8
+    told_along = [line for line in lines if line.startswith("step ")]
+    assert len(told_along) == 8
+    assert told_along[3].startswith(
+        f"step 240 of 450, episode 16: greedy return = {returns[3]:.3f}, coverage 0.1 = "
+    )
+    assert "(mean of 2 seeds)" in told_along[3]
+    assert all(re.search(r"steps/s, [1-9]\d* s left$", line) for line in told_along), (
+        "what closes the run takes time"
+    )
     table = next(number for number, line in enumerate(lines) if line.startswith("Table III"))
     assert lines[table + 2].split()[:4] == ["episode", "who", "Sh.", "Reward"]
     assert [line.split()[1] for line in lines[table + 4 : table + 10]] == [

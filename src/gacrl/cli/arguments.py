@@ -1,22 +1,15 @@
 """What each command understands, as dataclasses; their docstrings are the help."""
 
-import contextlib
-import difflib
-import io
-import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 import tyro
 
 from gacrl import tasks
 from gacrl.config import presets
-from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
-
-Arguments = TypeVar("Arguments")
 
 
 @dataclass(frozen=True)
@@ -24,10 +17,9 @@ class Cluster:
     """Several processes as one: each is started with the same command."""
 
     distributed: bool = False
-    """Be one of several processes (docs/guides/cluster.md); SLURM, Open MPI, Kubernetes or JAX_COORDINATOR_ADDRESS,
-    JAX_NUM_PROCESSES and JAX_PROCESS_ID say which, or these three:"""
-    coordinator: str | None = None
-    """HOST:PORT of process 0, with --distributed."""
+    """Be one of several processes (docs/guides/cluster.md). The cluster says which, or the three flags below do."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Where process 0 is, with --distributed."""
     num_processes: int | None = None
     """How many there are."""
     process_id: int | None = None
@@ -48,13 +40,43 @@ class Cluster:
 class Outside:
     """What does not come with the package; both are taken before anything else is understood."""
 
-    env: str | None = None
-    """The task: a name (`gacrl tasks`), or FILE.py:NAME, a Task, a subclass of Environment or an instance in that file,
-    which is run. Its settings are the flags --env.X."""
-    use: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    env: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
+    """The task: a name (`gacrl tasks`), or FILE.py:NAME, which is a Task or an Environment. That file is run."""
+    use: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
     """A Python file to run first: it adds messages, exploration rules or algorithms (examples/)."""
 
 
+@dataclass(frozen=True)
+class Messages:
+    """What happens to the policy's messages on their way: at most one of these. Scripted policies say nothing."""
+
+    silence: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="[AGENT …]")] = None
+    """Nobody hears these agents, counted from 0; without a number, nobody hears anybody."""
+    scramble: bool = False
+    """Every agent is heard with its words from another of the episodes: as many, and about nothing that goes on."""
+    drop: Annotated[float | None, tyro.conf.arg(metavar="P")] = None
+    """Each edge loses its messages in a step with this probability."""
+    delay: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
+    """Words arrive this many steps late; in an episode's first steps nothing arrives."""
+
+    def words(self) -> str:
+        """Write it as the setting `training.intervention`; nothing where no flag is given.
+
+        Raises UserError where there are several.
+        """
+        asked = {
+            "silence": self.silence,
+            "scramble": () if self.scramble else None,
+            "drop": None if self.drop is None else (self.drop,),
+            "delay": None if self.delay is None else (self.delay,),
+        }
+        given = {name: values for name, values in asked.items() if values is not None}
+        if len(given) > 1:
+            raise UserError(f"one thing at a time can be done to messages, not --{' and --'.join(given)}")
+        return "".join(" ".join((name, *map(str, values))) for name, values in given.items())
+
+
+MESSAGES = Annotated[Messages, tyro.conf.arg(name="")]
 ON_TASK = Annotated[Outside, tyro.conf.arg(name="")]
 
 
@@ -91,9 +113,9 @@ class Train:
 
     settings: Annotated[Settings, tyro.conf.arg(name="")]
     outside: ON_TASK = Outside()
-    begin_from: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start with what a run has learned: a folder, FOLDER@k or FOLDER@best, or pretrained:NAME."""
-    config: Path | None = None
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A JSON file of settings, all or some."""
     env_steps: int | None = None
     """Environment steps of each seed (short for --training.env-steps)."""
@@ -121,8 +143,7 @@ class Resume:
     extend: int | None = None
     """Environment steps to train past the planned end."""
     diagnose: bool = False
-    """Play what follows the newest checkpoint again, one update at a time, and print the first that is not finite;
-    nothing is written."""
+    """Write nothing, but play on from the newest checkpoint, and print the first update that is not finite."""
     outside: ON_TASK = Outside()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
@@ -133,26 +154,30 @@ class Resume:
 class Evaluate:
     """Measure a policy on fixed episodes: greedy and sampled, beside policies that learn nothing.
 
-    RUN is a run folder, FOLDER@k for its member k, FOLDER@best for how it was when it scored best, or random, noop, or
-    a scripted policy of the task: of spread oracle, or local (an oracle that sees what is near and assigns nothing).
-    Every score_ is 0 for random and 1 for the first of the task's own. Flags --env.X change the task's settings; --X is
-    short for them where no other flag has that name.
+    RUN may be one of these: random, noop (which does nothing), or a scripted policy of the task. Spread has oracle,
+    which sees everything, and local, which sees what is near and assigns nothing. A score_ in the JSON is 0 for random
+    and 1 for the first scripted policy of the task.
+
+    Flags --env.X change the task's settings; --X is short for them where no other flag has that name.
 
     examples:
       gacrl evaluate runs/paper-1
       gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
       gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
+      gacrl evaluate runs/gacrl-1 --silence 0 2       what are the messages of these two agents worth?
     """
 
     run: tyro.conf.Positional[str]
+    """A run folder; FOLDER@k for its k-th seed, from 0; FOLDER@best for its best policy; or a policy by name."""
     episodes: int = 320
     """Episodes to play."""
     horizon: int | None = None
-    """Steps of an episode (short for --env.max-cycles); none: as in training (the task's own for scripted policies)."""
+    """Steps of an episode (short for --env.max-cycles); none: as many as in training, or the task's own."""
     backend: Literal["jax", "mpe2"] = "jax"
     """Our environment, or the real MPE2."""
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
+    messages: MESSAGES = Messages()
     outside: ON_TASK = Outside()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -160,24 +185,28 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Draw episodes as an animated GIF: what the task shows, who hears whom, and what is said.
+    """Draw episodes as an animated GIF or MP4: what the task shows, who hears whom, and what is said.
 
-    Flags --env.X change the task's settings, as in `gacrl evaluate`.
+    MP4 needs ffmpeg. Flags --env.X change the task's settings, as in `gacrl evaluate`.
 
     examples:
       gacrl render runs/paper-1 --out paper.gif
+      gacrl render runs/paper-1 --out paper.mp4
       gacrl render oracle --out oracle.gif --episodes 2
+      gacrl render runs/gacrl-1 --silence --out silent.gif
     """
 
     run: tyro.conf.Positional[str]
+    """A run folder, FOLDER@k, FOLDER@best, or a policy by name, as in `gacrl evaluate`."""
     out: Path = field(default=Path("episodes.gif"))
-    """The file to write; one that exists is not overwritten without --overwrite."""
+    """The file to write, .gif or .mp4; one that exists is not overwritten without --overwrite."""
     episodes: int = 4
     """Episodes to show."""
     horizon: int | None = None
-    """Steps of an episode (short for --env.max-cycles); none: as in training (the task's own for scripted policies)."""
+    """Steps of an episode (short for --env.max-cycles); none: as many as in training, or the task's own."""
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
+    messages: MESSAGES = Messages()
     outside: ON_TASK = Outside()
     sampled: bool = False
     """Explore as in training, instead of playing greedily."""
@@ -230,7 +259,7 @@ class Compare:
 class Presets:
     """List what can be trained by name.
 
-    example:
+    examples:
       gacrl presets
     """
 
@@ -256,7 +285,7 @@ class Tasks:
 class Config:
     """Print a preset's settings, complete, as a file that `gacrl train --config FILE` loads.
 
-    example:
+    examples:
       gacrl config --preset paper > my.json
     """
 
@@ -327,8 +356,9 @@ class Sweep:
     FILE.toml says what is searched and by which metric (docs/guides/cluster.md); every trial is a run folder. Trials
     are trained here, one after the other, or on a Ray cluster, where Optuna proposes them and poor ones are given up.
 
-    paper-grid is the paper's: learning rate × ε₀ × τ₀, 27 points in one program, by shaped reward over the first 500
-    episodes; the winner is trained again on fresh seeds beside the paper's choice, and beside what chance alone makes.
+    paper-grid is the paper's: 27 settings of learning rate, ε and τ at the start (random actions, temperature of
+    messages), by shaped reward over the first 500 episodes. The winner is trained again on fresh seeds beside the
+    paper's choice, and the report says how much of the differences chance alone makes.
 
     examples:
       gacrl sweep search.toml
@@ -336,10 +366,10 @@ class Sweep:
       gacrl sweep paper-grid --out runs/grid
     """
 
-    spec: tyro.conf.Positional[str]
+    spec: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SPEC")]
     """A TOML file, or paper-grid."""
-    ray: str | None = None
-    """HOST:PORT of a Ray cluster's head, or auto."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """The head of a Ray cluster, or auto."""
     trial_cpus: float = 1.0
     """CPU cores that a trial takes, with --ray."""
     trial_gpus: float = 0.0
@@ -359,82 +389,9 @@ class Sweep:
 class Doctor:
     """Check this machine: devices, parity with the installed MPE2, and that algorithms learn the probes.
 
-    example:
+    examples:
       gacrl doctor
     """
 
     json: bool = False
     """Make the last line of the output one JSON object."""
-
-
-def parse(kind: type[Arguments], words: list[str], command: str, default: Arguments | None = None) -> Arguments:
-    """The arguments by their dataclass. Raises UserError with one sentence for what cannot be understood."""
-    return _parsed(kind, words, command, default, False)
-
-
-def parse_known(kind: type[Arguments], words: list[str], command: str) -> tuple[Arguments, list[str]]:
-    """The same, and the words that are none of its flags."""
-    return _parsed(kind, words, command, None, True)
-
-
-def _parsed(kind: Any, words: list[str], command: str, default: Any, rest_is_returned: bool) -> Any:
-    given: dict[str, Any] = {} if default is None else {"default": default}
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            return tyro.cli(
-                kind,
-                prog=f"gacrl {command}",
-                args=words,
-                config=(tyro.conf.AvoidSubcommands,),
-                return_unknown_args=rest_is_returned,
-                **given,
-            )
-    except SystemExit as stop:
-        if stop.code == 0:
-            raise
-        raise UserError(_sentence(said.getvalue(), command)) from None
-
-
-@dataclass(frozen=True)
-class _Changed:
-    env: Any
-
-
-def changed(settings: Any, words: list[str], command: str, kind: type) -> Any:
-    """A task's settings with those that `--env.X V`, or `--X V`, say.
-
-    kind: the arguments of the command, whose other flags may be meant. Raises UserError (ConfigError out of range).
-    """
-    names = {field.name.replace("_", "-"): field.name for field in fields(settings)}
-    flags: list[str] = []
-    for word in words:
-        name, equals, value = word.partition("=")
-        bare = name.removeprefix("--").removeprefix("env.").replace("_", "-")
-        if not name.startswith("--"):
-            flags.append(word)
-        elif bare.removeprefix("no-") in names or bare in names:
-            flags.append(f"--env.{bare}{equals}{value}")
-        elif name.startswith("--env."):
-            raise UserError(unknown("setting", f"env.{bare}", {f"env.{known}" for known in names}))
-        else:
-            flags_of = [f"--{known.name.replace('_', '-')}" for known in fields(kind)]
-            known = [*flags_of, *(f"--{known}" for known in names)]
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-            mend = f"did you mean {near[0]}?" if near else f"see `gacrl {command} --help`"
-            raise UserError(f"unrecognized option {name}: {mend}")
-    return parse(_Changed, flags, command, _Changed(settings)).env
-
-
-def _sentence(box: str, command: str) -> str:
-    """One sentence out of the parser's box: what is wrong, and the nearest option there is."""
-    lines = [line.strip("│ ") for line in box.splitlines()[1:]]  # the first one is the box's title
-    lines = [line if line.strip("╰╯─-") else "" for line in lines]
-    problem = "\n".join(lines).strip().split("\n\n")[0].replace("\n", " ")
-    problem = re.sub(r"^Error parsing (?!--)\S+: ", "", problem).rstrip(". ")
-    problem = problem[:1].lower() + problem[1:]
-    wrong = re.findall(r"--[\w.-]+", problem)
-    options = [line.split()[0] for line in lines if line.startswith("--")]
-    near = difflib.get_close_matches(wrong[0], options, n=1, cutoff=0.3) if wrong else []
-    mend = f"did you mean {near[0]}?" if near and near[0] not in problem else f"see `gacrl {command} --help`"
-    return f"{problem}: {mend}"

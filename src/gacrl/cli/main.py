@@ -5,6 +5,7 @@ Nothing heavy is imported before a command is known: `gacrl --help` answers at o
 
 import contextlib
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
@@ -13,14 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
+from gacrl.cli import output, stopwatch
 from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, full_memory, reason
+from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
-    from gacrl.cli.arguments import Cluster, Evaluate, Render, Resume, Sweep
+    from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume, Sweep
     from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
     from gacrl.experiments.ablate import Ablation
     from gacrl.experiments.paper.reproduce import Reproduction
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from gacrl.experiments.study import Watch
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
+    from gacrl.types import Intervention
 
 OVERVIEW = """\
 gacrl: learning to coordinate by communicating over a graph
@@ -37,7 +41,7 @@ usage: gacrl COMMAND [OPTIONS]
   train      train a preset or your own settings into a new run folder
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
-  render     watch a run, random, noop or oracle: a GIF
+  render     watch a run, random, noop or oracle: a GIF or MP4
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
@@ -56,29 +60,25 @@ usage: gacrl COMMAND [OPTIONS]
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C."""
-    words = list(sys.argv[1:] if words is None else words)
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(OVERVIEW, end="")
-        return 0
-    if words[0] == "--version":
-        from gacrl.versions import version
+    """Run one command and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C (143 after SIGTERM).
 
-        print(f"gacrl {version()}")
-        return 0
+    words: those of the process where none are given, whose output streams are then made fit for everything.
+    """
+    stopwatch.begin(with_process=words is None)
+    if words is None:
+        output.prepare()
+    words = list(map(_at_home, sys.argv[1:] if words is None else words))
     try:
-        if words[0] not in _COMMANDS:
-            raise UserError(unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
-        return _run(words[0], words[1:])
+        try:
+            return _answer(words)
+        finally:
+            output.finish()
     except UserError as error:
         print(f"gacrl: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # whoever read our output has seen enough
-        sys.stderr.close()
-        return 0
     except OSError as error:
-        name = f" {error.filename}" if error.filename else ""
-        print(f"gacrl: cannot use{name}: {reason(error)}", file=sys.stderr)
+        what = f"cannot use {error.filename}" if error.filename else "cannot read or write"
+        print(f"gacrl: {what}: {reason(error)}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:  # JAX's own is one; its class would have to be imported
         said = full_memory(error)
@@ -93,6 +93,29 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("gacrl: interrupted", file=sys.stderr)
         return 130
+
+
+def _answer(words: list[str]) -> int:
+    """Run a command, or say which there are."""
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(folded(OVERVIEW, terminal_width()))
+        return 0
+    if words[0] == "--version":
+        from gacrl.versions import version
+
+        print(f"gacrl {version()}")
+        return 0
+    if words[0] not in _COMMANDS:
+        raise UserError(unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
+    return _run(words[0], words[1:])
+
+
+def _at_home(word: str) -> str:
+    """The word with the home folder in place of its tilde, which shells leave in `--out=~/runs`."""
+    flag, equals, value = word.partition("=")
+    if flag.startswith("--") and equals:
+        return f"{flag}={os.path.expanduser(value)}"  # noqa: PTH111 a Path would change what is no path
+    return os.path.expanduser(word)  # noqa: PTH111
 
 
 class _Words(list[str]):
@@ -146,16 +169,20 @@ def _bring(name: str, blame: contextlib.ExitStack) -> str:
 
 
 def _train(words: _Words) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
     base = arguments.Settings.of(_base_settings(words))
-    asked = arguments.parse(arguments.Train, words, "train", default=arguments.Train(base))
+    asked = parsing.parse(arguments.Train, words, "train", default=arguments.Train(base))
     config = asked.settings.plain()
     if asked.env_steps is not None and asked.episodes is not None:
         raise UserError("--env-steps and --episodes say the same thing: give one of them")
     env_steps = asked.env_steps if asked.episodes is None else asked.episodes * _horizon(config)
     if env_steps is not None:
-        config = replace(config, training=replace(config.training, env_steps=env_steps))
+        flag, asked_for = ("--env-steps", env_steps) if asked.episodes is None else ("--episodes", asked.episodes)
+        if asked_for < 1:
+            raise UserError(f"{flag} must be at least 1, not {asked_for}")
+        with _called(flag, "training.env_steps"):
+            config = replace(config, training=replace(config.training, env_steps=env_steps))
 
     def start(watcher: "Watcher") -> "Ended":
         from gacrl import play
@@ -167,6 +194,15 @@ def _train(words: _Words) -> int:
     return _watched(start, asked.json, config, asked.cluster)
 
 
+@contextlib.contextmanager
+def _called(flag: str, setting: str) -> Generator[None]:
+    """Call a setting that is out of range by the flag that set it."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(str(error).replace(setting, flag)) from error
+
+
 def _horizon(config: RunConfig) -> int:
     """Steps of an episode."""
     steps = getattr(config.env, "max_cycles", None)
@@ -174,9 +210,9 @@ def _horizon(config: RunConfig) -> int:
 
 
 def _resume(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Resume, words, "resume")
+    asked = parsing.parse(arguments.Resume, words, "resume")
     if asked.extend is not None and asked.extend < 1:
         raise UserError(f"--extend must be at least 1 environment step, not {asked.extend}")
     if asked.diagnose:
@@ -264,14 +300,30 @@ def _base_settings(words: _Words) -> RunConfig:
                 raise UserError(f"{flag} needs a value: see `gacrl train --help`")
     base = presets.preset(named["--preset"]) if "--preset" in named else None
     if "--config" in named:
-        base = configuration.load(Path(named["--config"]), base)
+        file = Path(named["--config"])
+        loaded = configuration.load(file, base)
+        if base is not None:
+            _require_same(file, loaded, base)
+        base = loaded
     base = presets.preset() if base is None else base
     return base if words.task is None else configuration.on_task(base, words.task)
 
 
+def _require_same(file: Path, loaded: RunConfig, preset: RunConfig) -> None:
+    """Raises UserError where a file of settings is of another preset or algorithm than the preset that is named."""
+    mend = f"leave --preset {preset.preset} out"
+    if loaded.preset != preset.preset:
+        raise UserError(f"{file} is of the preset {loaded.preset}: {mend}, or take `preset` out of the file")
+    if loaded.algorithm.name != preset.algorithm.name:
+        raise UserError(
+            f"{file} sets the algorithm {loaded.algorithm.name}, and the preset {preset.preset} trains "
+            f"{preset.algorithm.name}: {mend}"
+        )
+
+
 def _changes(asked: "Evaluate | Render", rest: list[str], command: str) -> Callable[[Any], Any]:
     """What the flags change about the task that is played."""
-    from gacrl.cli import arguments
+    from gacrl.cli import parsing
 
     short = {"--horizon": ("max_cycles", asked.horizon), "--num-agents": ("num_agents", asked.num_agents)}
     asked_for = {flag: (name, value) for flag, (name, value) in short.items() if value is not None}
@@ -280,16 +332,29 @@ def _changes(asked: "Evaluate | Render", rest: list[str], command: str) -> Calla
         for flag, (name, _) in asked_for.items():
             if name not in {field.name for field in fields(settings)}:
                 raise UserError(f"the task has no setting {name}: leave {flag} out")
-        flags = [word for name, value in asked_for.values() for word in (f"--env.{name}", str(value))]
-        return arguments.changed(settings, [*rest, *flags], command, type(asked))
+        with contextlib.ExitStack() as called:
+            for flag, (name, _) in asked_for.items():
+                called.enter_context(_called(flag, f"--env.{name.replace('_', '-')}"))
+            flags = [word for name, value in asked_for.values() for word in (f"--env.{name}", str(value))]
+            return parsing.changed(settings, [*rest, *flags], command, type(asked))
 
     return change
 
 
-def _evaluate(words: _Words) -> int:
-    from gacrl.cli import arguments
+def _intervention(asked: "Messages") -> "Intervention | None":
+    """What the flags do to messages."""
+    from gacrl.messages import interventions
 
-    asked, rest = arguments.parse_known(arguments.Evaluate, words, "evaluate")
+    words = asked.words()
+    name = words.partition(" ")[0]
+    with _called(f"--{name} must", f"{name} must"):
+        return interventions.parse(words)
+
+
+def _evaluate(words: _Words) -> int:
+    from gacrl.cli import arguments, parsing
+
+    asked, rest = parsing.parse_known(arguments.Evaluate, words, "evaluate")
     if asked.episodes < 1:
         raise UserError(f"--episodes must be at least 1, not {asked.episodes}")
     from gacrl.training.devices import prepare_jax
@@ -305,6 +370,7 @@ def _evaluate(words: _Words) -> int:
         backend=asked.backend,
         warn=_warn,
         task=words.task or tasks.DEFAULT,
+        intervention=_intervention(asked.messages),
     )
     print_evaluation(scores)
     if asked.json:
@@ -313,9 +379,9 @@ def _evaluate(words: _Words) -> int:
 
 
 def _render(words: _Words) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked, rest = arguments.parse_known(arguments.Render, words, "render")
+    asked, rest = parsing.parse_known(arguments.Render, words, "render")
     if not 1 <= asked.episodes <= 100:
         raise UserError(f"--episodes must be between 1 and 100, not {asked.episodes}")
     if not 120 <= asked.size <= 4096:
@@ -327,25 +393,29 @@ def _render(words: _Words) -> int:
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
-    from gacrl import render
+    from gacrl import film
     from gacrl.experiments import scoring
 
     out = asked.out.absolute()  # a task may change the folder of the process
+    film.require_format(out)
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
-    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task)
+    happens = _intervention(asked.messages)
+    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
     if shown.episodes[0].scene is None:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )
-    render.gif(shown.episodes, out, size=asked.size, title=asked.run, words=shown.task.words)
-    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}")
+    told = "" if shown.intervention is None else shown.intervention.told
+    title = f"{told}: {asked.run}" if told else asked.run
+    film.write(shown.episodes, out, size=asked.size, title=title, words=shown.task.words)
+    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}" + (f"; {told}" if told else ""))
     return 0
 
 
 def _compare(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Compare, words, "compare")
+    asked = parsing.parse(arguments.Compare, words, "compare")
     from gacrl.experiments.compare import compare
     from gacrl.experiments.compare import data as compare_data
     from gacrl.experiments.compare import report as compare_report
@@ -380,9 +450,9 @@ def _compare(words: list[str]) -> int:
 
 
 def _reproduce(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Reproduce, words, "reproduce")
+    asked = parsing.parse(arguments.Reproduce, words, "reproduce")
     from gacrl.training.devices import prepare_jax
 
     prepare_jax(max(asked.seeds, 1))
@@ -413,9 +483,9 @@ def _studied(
 
 
 def _ablate(words: _Words) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Ablate, words, "ablate")
+    asked = parsing.parse(arguments.Ablate, words, "ablate")
     from gacrl.training.devices import prepare_jax
 
     prepare_jax(max(asked.seeds, 1))
@@ -430,9 +500,9 @@ def _ablate(words: _Words) -> int:
 
 
 def _sweep(words: _Words) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Sweep, words, "sweep")
+    asked = parsing.parse(arguments.Sweep, words, "sweep")
     out = asked.out or Path("runs") / Path(asked.spec).stem
     if asked.spec != "paper-grid":
         return _search(asked, out, words.task)
@@ -477,35 +547,35 @@ def _search(asked: "Sweep", out: Path, task: str | None) -> int:
 
 
 def _presets(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Presets, words, "presets")
+    asked = parsing.parse(arguments.Presets, words, "presets")
     for name, (description, _) in presets.PRESETS.items():
-        default = "  (the default)" if name == presets.DEFAULT_PRESET else ""
-        print(f"{name:12} {description}{default}")
+        default = " (the default)" if name == presets.DEFAULT_PRESET else ""
+        print(folded(f"{name:12}  {description}{default}", terminal_width()))
     if asked.json:
         print(json.dumps({name: description for name, (description, _) in presets.PRESETS.items()}))
     return 0
 
 
 def _tasks(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Tasks, words, "tasks")
+    asked = parsing.parse(arguments.Tasks, words, "tasks")
     from gacrl.experiments import anchors
 
     rows = [anchors.row(name) for name in tasks.names()]
     for row in rows:
-        print(anchors.sentence(row))
+        print(folded(anchors.sentence(row), terminal_width()))
     if asked.json:
         print(json.dumps({row["task"]: row for row in rows}))
     return 0
 
 
 def _config(words: _Words) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Config, words, "config")
+    asked = parsing.parse(arguments.Config, words, "config")
     config = presets.preset(asked.preset)
     config = config if words.task is None else configuration.on_task(config, words.task)
     print(configuration.dumps(config), end="")
@@ -513,23 +583,22 @@ def _config(words: _Words) -> int:
 
 
 def _doctor(words: list[str]) -> int:
-    from gacrl.cli import arguments
+    from gacrl.cli import arguments, parsing
 
-    asked = arguments.parse(arguments.Doctor, words, "doctor")
+    asked = parsing.parse(arguments.Doctor, words, "doctor")
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
-    from gacrl.doctor import examine
+    from gacrl.cli.terminal import print_examination
+    from gacrl.doctor import checks
 
-    healthy = True
-    findings: dict[str, Any] = {}
-    for finding in examine():
-        print(f"{'ok ' if finding.good else 'BAD'} {finding.what}: {finding.detail}", flush=True)
-        findings[finding.what] = {"good": finding.good, "detail": finding.detail}
-        healthy &= finding.good
+    findings = print_examination(checks())
     if asked.json:
-        print(json.dumps(findings))
-    return 0 if healthy else 1
+        print(json.dumps({it.what: {"good": it.good, "detail": it.detail} for it in findings}))
+    bad = [finding.what for finding in findings if not finding.good]
+    if bad:
+        raise UserError(f"this machine does not do what it must: {', '.join(bad)}")
+    return 0
 
 
 def _warn(sentence: str) -> None:

@@ -3,10 +3,7 @@
 A leaf, so that every room that prints may use it.
 """
 
-import io
-import os
 import re
-import sys
 from collections.abc import Sequence
 
 from rich import box
@@ -16,27 +13,12 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-WIDTH = 130
-"""Columns of what is no terminal, where COLUMNS does not say: a log can hold them."""
+from gacrl.report.letters import in_letters_of
+
 _PADDING = 3
 """Columns of the screen that rich puts between two columns of a table."""
 _LINES = 3
 """Of a cell; one that would take more turns the table into blocks."""
-
-
-class Screen(Console):
-    """Standard output, plain: characters that it cannot encode are written as escapes; a closed pipe is an error."""
-
-    def __init__(self) -> None:
-        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-            sys.stdout.reconfigure(errors="backslashreplace")
-        super().__init__(highlight=False, markup=False, emoji=False)
-        if not self.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
-            self.width = WIDTH
-
-    def on_broken_pipe(self) -> None:
-        """Raises BrokenPipeError, which the command line knows; rich would exit with 1."""
-        raise BrokenPipeError
 
 
 def print_table(console: Console, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -44,7 +26,7 @@ def print_table(console: Console, columns: Sequence[str], rows: Sequence[Sequenc
 
     Words wrap at spaces; a cell without letters, such as a number with its interval, stays on one line.
     """
-    columns, *rows = [[_encodable(console, text) for text in row] for row in (columns, *rows)]
+    columns, *rows = [[in_letters_of(console.encoding, text) for text in row] for row in (columns, *rows)]
     widths = _fitted(columns, rows, console.width - 1)
     if widths is None:
         _print_blocks(console, columns, rows)
@@ -55,11 +37,6 @@ def print_table(console: Console, columns: Sequence[str], rows: Sequence[Sequenc
     for row in rows:
         table.add_row(*row)
     console.print(table)
-
-
-def _encodable(console: Console, text: str) -> str:
-    """The text as it will stand on the screen, so that its width is known."""
-    return text.encode(console.encoding, "backslashreplace").decode(console.encoding)
 
 
 def _fitted(columns: Sequence[str], rows: Sequence[Sequence[str]], room: int) -> list[int] | None:

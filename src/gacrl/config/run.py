@@ -80,11 +80,11 @@ class RunConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     preset: str = "gacrl"
-    """The preset that this started from."""
+    """The preset that these settings start from (`gacrl presets`)."""
     seed: int = 0
-    """Seed of the first member."""
+    """The random seed; of several, the first."""
     num_seeds: int = 1
-    """Members: independent runs with the seeds seed, seed + 1, …"""
+    """Independent trainings side by side, with the seeds seed, seed + 1, …"""
 
     def __post_init__(self) -> None:
         take_types("run", self)

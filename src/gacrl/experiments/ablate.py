@@ -69,7 +69,10 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "no-central-critic": Part("values summed, as VDN does", _algorithm(critic="sum")),
         "linear-exploration": Part("ε and τ fall with time alone", _algorithm(exploration="linear")),
         "fixed-exploration": Part("ε and τ stay at their end", _algorithm(exploration="fixed")),
-        YOKED: Part("the levels of 'all parts' replayed, mean over its seeds", _algorithm(exploration="yoked")),
+        YOKED: Part(
+            "explores as much as 'all parts' did at that time (mean over its seeds), whatever its own progress is",
+            _algorithm(exploration="yoked"),
+        ),
         "no-symmetry": Part("what is replayed is not turned", _algorithm(augment=False)),
         "plain-play": Part(
             "played in the world as it is, not by the mean over its turns", _algorithm(symmetric_play=False)
@@ -155,7 +158,7 @@ def ablate(
     asked = {"config": configuration.to_dict(config)}
     claim_folder(out, "ablate.json", asked, "ablation", lambda held: "another ablation: choose another --out")
     refuse_other_settings([run for run in runs if run.name != YOKED])  # its settings come from a run
-    watch.planned([run.name for run in runs])
+    watch.planned({run.name: parts_of(config)[run.name].says if run.name != FULL else "" for run in runs})
     if not train_missing(runs[:1], watch):
         return None
     because = why_diverged(runs[0].folder)
@@ -351,9 +354,10 @@ def _worths(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
     page.heading("The probability that a part helps")
     page.table(("without", *outcomes[0].final, f"detectable {task.headline}"), rows)
     page.text(
-        "The probability that a seed with all parts ends with a better value than one without this one. It is claimed "
-        "where it is .95 or more and its interval lies above .5; fewer than 10 seeds indicate. Detectable: the "
-        f"smallest difference of mean {task.headline} that so many seeds would show in 80 % of all repetitions."
+        "The probability that a seed with all parts ends with a better value than one without this one. One may say "
+        "that a part helps where it is .95 or more, its interval lies above .5, and there are 10 seeds; fewer "
+        f"indicate. Detectable: the smallest difference of mean {task.headline} that so many seeds would show in 80 % "
+        "of all repetitions."
     )
 
 

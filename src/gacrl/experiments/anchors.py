@@ -28,4 +28,4 @@ def sentence(row: dict[str, Any]) -> str:
     """The row as a line."""
     told = [f"{who} {score:.2f}" for who, score in row["scores"].items() if score is not None]
     scores = f"; {row['headline']}: {', '.join(told)}" if told else ""
-    return f"{row['task']:16} {row['summary']}{scores}"
+    return f"{row['task']:16}  {row['summary']}{scores}"

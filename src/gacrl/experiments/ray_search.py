@@ -20,6 +20,7 @@ from gacrl.errors import UserError
 from gacrl.experiments import search
 from gacrl.experiments.search import PRUNED, Search, Searched, Spec
 from gacrl.experiments.study import Planned, Watch, train_missing
+from gacrl.report.screen import Pace
 from gacrl.training import devices
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
@@ -61,7 +62,7 @@ def ray_search(spec: Spec, out: Path, address: str, cpus: float, gpus: float, wa
     _require_cluster(address)
     out = out.resolve()
     search.claim(spec, out, "Optuna")
-    watch.planned([])
+    watch.planned({})
     tried = search.trials_in(spec, out)
     missing = spec.trials - sum(trial.state != "unfinished" for trial in tried)
     if missing <= 0:
@@ -155,8 +156,12 @@ def _why_none_starts(node: Mapping[str, Any]) -> str:
 class _Follower(tune.Callback, tune.Stopper):  # pyright: ignore[reportUntypedBaseClass]
     """What Tune does, told, and noted in the trials' folders; and the wish to stop."""
 
-    def __init__(self, spec: Spec, out: Path, say: Callable[[str], None], stopping: Callable[[], bool]):
+    def __init__(
+        self, spec: Spec, out: Path, missing: int, say: Callable[[str], None], stopping: Callable[[], bool]
+    ):
+        """missing: trials that are still to be made."""
         self._spec, self._out, self._say, self._stopping = spec, out, say, stopping
+        self._missing, self._ended, self._pace = missing, 0, Pace(missing)
 
     def __reduce__(self) -> Any:  # Tune writes a copy of what it was given, for a restart that is not ours
         return tune.Callback, ()
@@ -169,7 +174,9 @@ class _Follower(tune.Callback, tune.Stopper):  # pyright: ignore[reportUntypedBa
         planned = self._trial(trial)
         if not planned.finished and not self._stopping():
             (planned.folder / PRUNED).write_text("{}\n", encoding="utf-8")
-        self._say(f"{planned.name}: {'done' if planned.finished else 'given up'}")
+        self._ended += 1
+        how, left = "done" if planned.finished else "given up", self._pace.left(self._ended)
+        self._say(f"{self._ended} of {self._missing}, {planned.name}: {how}; all trials: {left}")
 
     def _trial(self, trial: Any) -> Planned:
         return self._spec.trial(self._out, decoded(self._spec, trial.config))
@@ -186,7 +193,7 @@ def _tuner(
 ) -> Any:
     planned = spec.config.num_updates * spec.config.steps_per_update
     mode = "max" if spec.maximize else "min"
-    follower = _Follower(spec, out, watch.say, watch.run("search").stop)
+    follower = _Follower(spec, out, missing, watch.say, watch.run("search").stop)
     return tune.Tuner(
         tune.with_resources(
             tune.with_parameters(_train_trial, spec=spec, out=out, cpus=resources["cpu"]), dict(resources)

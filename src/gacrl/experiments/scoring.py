@@ -61,10 +61,11 @@ def score_run(
     """Measure a policy, greedy and sampled, beside the scripted policies on the same starts.
 
     task: in which a scripted policy plays. intervention: what happens to the policy's messages. Returns {run, backend,
-    episodes, horizon, num_agents, task, final: {greedy, sampled}, references} as in `summary.json`, and messages where
-    agents send symbols. MPE2 draws its own starts: there, the scripted policies play those. Raises UserError.
+    episodes, horizon, num_agents, task, final: {greedy, sampled}, references} as in `summary.json`; intervention, in
+    words, where there is one; and messages where agents send symbols. MPE2 draws its own starts: there, the scripted
+    policies play those. Raises UserError.
     """
-    messages, episodes = None, whole(episodes, "episodes", 1)
+    messages, done, episodes = None, None, whole(episodes, "episodes", 1)
     scripted = _scripted_task(run, task, change)
     if scripted is not None:
         _require_words(run, intervention)
@@ -75,6 +76,7 @@ def score_run(
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
         opened = open_run(run, change, warn, intervention)
+        done = _in_backend(backend, intervention, opened.trainer.intervention, warn)
         played = Played(opened.task, opened.config.env)
         _require_room(played, episodes, opened.trainer.memory)
         beside = _references(played, episodes, backend)
@@ -93,6 +95,7 @@ def score_run(
         "task": facts,
         "final": {kind: normalised(metrics, beside, facts) for kind, metrics in final.items()},
         "references": beside,
+        **({} if done is None else {"intervention": done.told}),
         **({} if messages is None else {"messages": messages}),
     }
 
@@ -123,7 +126,22 @@ def play(
 
 
 def _require_words(scripted: str, intervention: Intervention | None) -> None:
-    require(intervention is None, f"{scripted} says nothing: there are no messages to intervene in")
+    require(
+        intervention is None,
+        f"{scripted} says nothing: there are no messages to intervene in; leave the intervention out",
+    )
+
+
+def _in_backend(
+    backend: Backend, asked: Intervention | None, trained: Intervention | None, warn: Warn
+) -> Intervention | None:
+    """What happens to messages there; the real MPE2 knows our agents' messages, and nothing that is done to them."""
+    if backend == "jax":
+        return trained if asked is None else asked
+    require(asked is None, "in the real MPE2 every message arrives: take the backend jax, or no intervention")
+    if trained is not None:
+        warn(f"in training {trained.told}; in the real MPE2 every message arrives")
+    return None
 
 
 def _require_room(played: Played, episodes: int, memory: Memory = ()) -> None:
@@ -163,10 +181,11 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
 
 
 class Recorded(NamedTuple):
-    """Episodes of a policy to look at, and the task that they are of."""
+    """Episodes of a policy to look at, the task that they are of, and what happened to messages in them."""
 
     episodes: list[recording.Episode]
     task: Task
+    intervention: Intervention | None = None
 
 
 def record_run(
@@ -194,7 +213,8 @@ def record_run(
     look = references.look_of(played.task, played.settings)
     _require_room(played, episodes, memory)
     footprint.require_room_to_play(footprint.recording_bytes(env, params, episodes, look))
-    return Recorded(_record(policy, memory, env, params, episodes, intervention, look), played.task)
+    recorded = _record(policy, memory, env, params, episodes, intervention, look)
+    return Recorded(recorded, played.task, intervention)
 
 
 def _record(

@@ -246,8 +246,9 @@ def search(spec: Spec, out: Path, watch: Watch) -> Search | None:
     """Train what is missing under `out`, here; None where the watcher stopped it. Raises UserError."""
     out = out.absolute()
     claim(spec, out, "Halton")
-    planned = [spec.trial(out, values) for values in proposals(spec)]
-    watch.planned([trial.name for trial in planned])
+    proposed = proposals(spec)
+    planned = [spec.trial(out, values) for values in proposed]
+    watch.planned({trial.name: _listed(values) for trial, values in zip(planned, proposed, strict=True)})
     return conclude(spec, out) if train_missing(planned, watch) else None
 
 
@@ -324,6 +325,10 @@ def conclude(spec: Spec, out: Path) -> Search:
     done = Search(out, out / "report.html", ranked)
     (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
     return done
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {_short(value)}" for name, value in values.items())
 
 
 def _short(value: Any) -> str:

@@ -36,7 +36,8 @@ class Planned:
 class Watch:
     """What a study tells whoever looks on: all of it optional."""
 
-    planned: Callable[[list[str]], None] = lambda names: None
+    planned: Callable[[Mapping[str, str]], None] = lambda runs: None
+    """(names of the runs, and what each of them is)."""
     run: Callable[[str], Watcher] = lambda name: Watcher()
     finished: Callable[[str, str], None] = lambda name, how: None
     """(name, how it ended)."""

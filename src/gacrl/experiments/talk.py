@@ -142,7 +142,7 @@ def talk(
     asked = {"config": configuration.to_dict(runs[1].config)}
     claim_folder(out, "talk.json", asked, "study of talk", lambda held: "another study: choose another --out")
     refuse_other_settings(runs)
-    watch.planned([run.name for run in runs])
+    watch.planned({run.name: _HEARD[run.name] for run in runs})
     if not train_missing(runs, watch):
         return None
     watch.say("playing with silenced, scrambled and late messages")

@@ -38,7 +38,8 @@ def silence(agents: Sequence[int] | int | None = None) -> Intervention:
             muted = jnp.zeros(num_agents, bool).at[jnp.asarray(silenced, int)].set(True)
         return Arrives(kept=jnp.broadcast_to(~muted, (num_envs, num_agents, num_agents)))
 
-    return Intervention("silence", arrives, init)
+    heard = "nobody hears anybody" if agents is None else f"nobody hears {_named(silenced)}"
+    return Intervention("silence", arrives, init, told=heard)
 
 
 def swap(one: int, other: int) -> Intervention:
@@ -52,7 +53,8 @@ def swap(one: int, other: int) -> Intervention:
     def swapped(said: RoundOfWords) -> RoundOfWords:
         return said.at[:, (one, other)].set(said[:, (other, one)])
 
-    return Intervention("swap", _round_by_round(swapped), init)
+    told = f"{_named((one, other))} are heard with each other's words"
+    return Intervention("swap", _round_by_round(swapped), init, told=told)
 
 
 def scramble() -> Intervention:
@@ -66,7 +68,8 @@ def scramble() -> Intervention:
         require(words.shape[0] > 1, "to scramble messages takes at least two episodes side by side")
         return ()
 
-    return Intervention("scramble", _round_by_round(lambda said: jnp.roll(said, 1, axis=0)), init)
+    moved = _round_by_round(lambda said: jnp.roll(said, 1, axis=0))
+    return Intervention("scramble", moved, init, told="every agent is heard with its words from another episode")
 
 
 def drop(probability: float) -> Intervention:
@@ -77,7 +80,9 @@ def drop(probability: float) -> Intervention:
         num_envs, _, num_agents, _ = _shape(ask)
         return Arrives(kept=jax.random.bernoulli(key, 1.0 - probability, (num_envs, num_agents, num_agents)))
 
-    return Intervention("drop", arrives)
+    return Intervention(
+        "drop", arrives, told=f"each edge loses its messages in {100 * probability:g} % of the steps"
+    )
 
 
 def noise(probability: float) -> Intervention:
@@ -90,7 +95,7 @@ def noise(probability: float) -> Intervention:
         random = jax.random.randint(symbol_key, words, 0, symbols)
         return Arrives(jax.nn.one_hot(random, symbols), jax.random.bernoulli(replaced_key, probability, words))
 
-    return Intervention("noise", arrives)
+    return Intervention("noise", arrives, told=f"{100 * probability:g} % of the words are replaced by random ones")
 
 
 class _Late(NamedTuple):
@@ -119,7 +124,8 @@ def delay(steps: int) -> Intervention:
     def follow(state: _Late, said: Words, first: Bool[Array, " E"]) -> _Late:
         return _Late(jnp.concatenate([said[None], state.words[:-1]]), jnp.where(first, 0, state.step) + 1)
 
-    return Intervention("delay", arrives, init, follow)
+    late = f"words arrive {steps} step{'s' * (steps > 1)} late"
+    return Intervention("delay", arrives, init, follow, late)
 
 
 INTERVENTIONS: dict[str, tuple[Callable[..., Intervention], str]] = {
@@ -171,7 +177,7 @@ def arriving(what: Arrives) -> Intervention:
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (first.shape[0], *leaf.shape)), what)
 
-    return Intervention("replace", arrives)
+    return Intervention("replace", arrives, told="the same words arrive at every step")
 
 
 def example(text: str, words: Callable[[], tuple[int, ...] | None]) -> Arrives:
@@ -211,12 +217,18 @@ def _shape(ask: Ask) -> tuple[int, int, int, int]:
     return jax.eval_shape(ask, Arrives()).shape
 
 
+def _named(agents: Sequence[int]) -> str:
+    """Write agents in words: agent 0; agents 0, 1 and 2."""
+    *others, last = map(str, agents)
+    return f"agents {', '.join(others)} and {last}" if others else f"agent {last}"
+
+
 def _require_agents(name: str, agents: Sequence[int], words: Shape) -> None:
     num_agents = words.shape[2]
     for agent in agents:
         require(
             0 <= agent < num_agents,
-            f"there is no agent {agent} to {name}: they are counted from 0 to {num_agents - 1}",
+            f"{name}: there are the agents 0 to {num_agents - 1}, and no agent {agent}",
         )
 
 

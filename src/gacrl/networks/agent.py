@@ -186,13 +186,16 @@ def unroll(
 
 
 def words_said(network: AgentNetwork, env: Environment) -> tuple[int, ...] | None:
-    """Return the shape [R, N, V] of what the agents say in a step; None where they say nothing."""
+    """Return the shape [R, N, V] of what the agents say in a step; None where they say nothing.
 
-    def messages() -> Array | None:
+    network: with numbers, or their shapes alone.
+    """
+
+    def messages(network: AgentNetwork) -> Array | None:
         seen = env.reset(jax.random.key(0), env.default_params())[1]
         return network(seen, network.initial_memory(env.num_agents))[0].messages
 
-    said = jax.eval_shape(messages)
+    said = eqx.filter_eval_shape(messages, network)
     return None if said is None else said.shape
 
 

@@ -4,6 +4,7 @@ A leaf: it imports no jax, and a task only when somebody needs it. A task from o
 was given it (`bring`); a run folder alone never loads one.
 """
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib import import_module
@@ -95,7 +96,7 @@ def flag(name: str) -> str:
     """What a command needs besides to find this task again: nothing for the default one."""
     own = _OWN.get(name)
     if own is not None:
-        return f" --env {own.source or 'FILE.py'}:{name}"
+        return " --env " + shlex.quote(f"{own.source or 'FILE.py'}:{name}")
     return "" if name == DEFAULT else f" --env {name}"
 
 

@@ -20,7 +20,7 @@ from gacrl.training.curriculum import constant
 from gacrl.training.devices import mesh_for
 from gacrl.training.recorder import SHOWN_EPISODES
 from gacrl.training.trainer import Trainer, TrainState
-from gacrl.types import Intervention
+from gacrl.types import Intervention, Learner
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,14 @@ def member_shapes(trainer: Trainer) -> TrainState:
 
 def stacked_shapes(trainer: Trainer) -> TrainState:
     """The shapes of the training state of all seeds, as a checkpoint holds it."""
-    return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct((trainer.num_seeds, *leaf.shape), leaf.dtype), member_shapes(trainer)
-    )
+    return _stacked(member_shapes(trainer), trainer.num_seeds)
+
+
+def learner_shapes(trainer: Trainer) -> Learner:
+    """The shapes of the learners of all seeds. Environments, and what happens to messages in them, do not matter."""
+    algorithm = trainer.algorithm
+    return _stacked(jax.eval_shape(lambda: algorithm.init(jax.random.key(0), algorithm.hyper)), trainer.num_seeds)
+
+
+def _stacked(shapes: Any, num_seeds: int) -> Any:
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((num_seeds, *leaf.shape), leaf.dtype), shapes)

@@ -18,7 +18,7 @@ from gacrl.errors import UserError
 from gacrl.training.build import Plan
 from gacrl.training.devices import wait_for_all
 from gacrl.training.peers import Peers, Place, meet
-from gacrl.training.recorder import RunFolder
+from gacrl.training.recorder import RunFolder, resuming
 from gacrl.training.watching import Watcher
 from gacrl.versions import version
 
@@ -109,7 +109,7 @@ def joined(place: Place, settings: str, seconds: float, watcher: Watcher) -> Gen
 def _planned(peers: Peers, watcher: Watcher, folder: RunFolder, config: RunConfig, plan: Plan) -> None:
     if peers.place.process == 0:
         peers.mend = lambda: _mend(folder)
-        peers.tell(f"go on with `gacrl resume {folder.path}`")
+        peers.tell(f"go on with `{resuming(folder.path)}`")
     watcher.planned(folder, config, plan)
 
 
@@ -117,4 +117,4 @@ def _mend(folder: RunFolder) -> str:
     """Names the last checkpoint; whether it is whole is seen when it is read."""
     found = sorted(folder.checkpoints.glob("step-*"))
     last = f"the last checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
-    return f"{last}; go on with `gacrl resume {folder.path}`"
+    return f"{last}; go on with `{resuming(folder.path)}`"

@@ -13,8 +13,12 @@ import numpy as np
 
 from gacrl import tasks
 from gacrl.config.run import RunConfig
+from gacrl.evaluation.metrics import EpisodeSummary
+from gacrl.render import num_frames
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task
+from gacrl.training.forecast import closing_seconds, seconds_left
+from gacrl.training.recorder import SHOWN_EPISODES
 from gacrl.training.trainer import ChunkReport, Trainer, TrainState
 
 
@@ -50,17 +54,12 @@ class Progress:
     """Metrics of the task that stand in tables, headline first, and what they are called there."""
     whole: TrainState
     """The same; where it is spread over several processes, all of it in each of them."""
+    seconds_left: float
+    """Until the run has its summary and its GIF, by the pace so far."""
 
     @property
     def done(self) -> bool:
         return self.env_steps >= self.total_env_steps
-
-    @property
-    def seconds_left(self) -> float:
-        """By the pace of the chunks so far."""
-        seeds = len(self.rows)
-        pace = self.clock.steps_per_second
-        return (self.total_env_steps - self.env_steps) * seeds / pace if pace else float("nan")
 
 
 def train(
@@ -80,7 +79,7 @@ def train(
     done, total = env_steps // per_update, config.num_updates
     started, before = time.perf_counter(), clock
     compiling, training, timed = clock.compiling, clock.training, clock.timed_env_steps
-    chunk = None
+    chunk, compiling_evaluations = None, 0.0
     while done < total:
         updates = min(config.updates_per_chunk, total - done)
         if chunk is None:
@@ -102,8 +101,9 @@ def train(
             "sampled": trainer.evaluate(state.learner, True, "monitor", config.evaluation.num_episodes),
         }
         evaluations = jax.device_get(gathered(evaluations))
+        playing = time.perf_counter() - begun
         if first:  # compiling is nearly all of the first evaluation
-            compiling += time.perf_counter() - begun
+            compiling, compiling_evaluations, playing = compiling + playing, playing, 0.0
         wall = before.wall + time.perf_counter() - started
         clock = Clock(wall, training, compiling, timed)
         whole = gathered(state)
@@ -112,7 +112,18 @@ def train(
         told = [row["update"] for row in rows]
         replay = trainer.algorithm.replay(whole.learner)
         require_finite(config.seeds, told, whole.learner, replay, (done - updates) * per_update, done * per_update)
-        yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole)
+        closing = _closing(trainer, config, compiling_evaluations, playing)
+        to_train, to_play = (total - done) * per_update * len(rows), -(-(total - done) // config.updates_per_chunk)
+        left = seconds_left(to_train, clock.steps_per_second, to_play, playing, closing)
+        yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole, left)
+
+
+def _closing(trainer: Trainer, config: RunConfig, compiling: float, playing: float) -> float:
+    """Seconds that will pass after the last chunk."""
+    more = config.evaluation.final_episodes / config.evaluation.num_episodes
+    return closing_seconds(
+        compiling, playing, more, SHOWN_EPISODES * num_frames(trainer.evaluation_env.max_cycles)
+    )
 
 
 def _rows(
@@ -128,21 +139,11 @@ def _rows(
 
     def row(member: int, seed: int) -> dict[str, Any]:
         seen = jax.tree.map(lambda leaf: leaf[member], report.episodes)
-        mean = seen.total / max(seen.ended, 1)
-        spread = np.sqrt(np.maximum(seen.squares / max(seen.ended, 1) - mean**2, 0.0))
-        mean, spread, last = (
-            dict(zip(names, map(float, vector), strict=True)) for vector in (mean, spread, seen.last)
-        )
         return {
             "seed": seed,
             "env_steps": env_steps,
             "episodes_done": int(finished[member]),
-            "train": {
-                "episodes": int(seen.ended),
-                "mean": mean,
-                "sd": spread,
-                "last_episode": last,
-            },
+            "train": _training_episodes(seen, names),
             "update": {name: float(values[member]) for name, values in report.metrics.items()},
             "task": _difficulty(report.env_params, member),
             **{
@@ -155,6 +156,18 @@ def _rows(
         }
 
     return tuple(row(member, seed) for member, seed in enumerate(config.seeds))
+
+
+def _training_episodes(seen: EpisodeSummary, names: tuple[str, ...]) -> dict[str, Any]:
+    """The episodes that ended in a chunk of one seed; None in place of every number where none did."""
+    ended = int(seen.ended)
+    mean = seen.total / max(ended, 1)
+    spread = np.sqrt(np.maximum(seen.squares / max(ended, 1) - mean**2, 0.0))
+
+    def named(vector: Any) -> dict[str, float | None]:
+        return dict(zip(names, map(float, vector), strict=True)) if ended else dict.fromkeys(names)
+
+    return {"episodes": ended, "mean": named(mean), "sd": named(spread), "last_episode": named(seen.last)}
 
 
 def _difficulty(env_params: Any, member: int) -> dict[str, float]:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from filelock import FileLock, Timeout
 
 from gacrl import tasks
 from gacrl.config import files as configuration
+from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.versions import version
@@ -46,9 +48,9 @@ class RunFolder:
         configuration.from_dict(configuration.to_dict(config))  # refuses now what could not be loaded again
         try:
             if path is None:
-                path = _next_free(Path("runs"), config.preset)
+                path = _next_free(Path("runs"), label(config))
             elif path.exists() and (not path.is_dir() or any(path.iterdir())):
-                mend = f", or continue it with `gacrl resume {path}`" if _is_run(path) else ""
+                mend = f", or continue it with `{resuming(path)}`" if _is_run(path) else ""
                 raise UserError(f"{path} exists and is not overwritten: choose another --out{mend}")
             else:
                 path.mkdir(parents=True, exist_ok=True)
@@ -156,7 +158,7 @@ class RunFolder:
 
     def resumed_by(self, task: str) -> str:
         """Return the command that resumes this run of a task."""
-        return f"gacrl resume {self.path}{tasks.flag(task)}"
+        return resuming(self.path, task)
 
     def append_metrics(self, rows: list[dict[str, Any]]) -> None:
         """Add one line per row to `metrics.jsonl` and see it to the disk."""
@@ -224,6 +226,11 @@ class RunFolder:
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
+
+
+def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
+    """The command that goes on with a run, to copy: whatever its folder is called."""
+    return f"gacrl resume {shlex.quote(str(path))}{tasks.flag(task)}"
 
 
 def _origin(config: RunConfig, begun_from: str | None) -> dict[str, Any]:

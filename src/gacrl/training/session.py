@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from gacrl import render, tasks
 from gacrl.config import files as configuration
 from gacrl.config.checks import whole
+from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation import episodes, references
@@ -20,7 +21,14 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
-from gacrl.training.build import evaluated_settings, make_trainer, member_shapes, plan, stacked_shapes
+from gacrl.training.build import (
+    evaluated_settings,
+    learner_shapes,
+    make_trainer,
+    member_shapes,
+    plan,
+    stacked_shapes,
+)
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
@@ -292,12 +300,12 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
         for number, episode in enumerate(shown):
             episode.save(folder.episodes / f"{number}.npz")
         if shown and shown[0].scene is not None:
-            title = f"{config.preset}, seed {config.seed}"
+            title = f"{label(config)}, seed {config.seed}"
             render.gif(shown, folder.gif, title=title, words=task.words)
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
-    shapes = trainer.algorithm.acting(stacked_shapes(trainer).learner)
+    shapes = trainer.algorithm.acting(learner_shapes(trainer))
     learners = checkpoint.load(found, shapes, prefix=".learner")
     return shard_seeds(learners, trainer.mesh)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gacrl import tasks
-from gacrl.cli.tables import Screen, print_table
+from gacrl.cli.tables import print_table
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import Equivalence, with_interval
 from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair
 from gacrl.experiments.compare.groups import Group
+from gacrl.report.screen import console
 
 if TYPE_CHECKING:
     from gacrl.report.figures import Look, Series
@@ -60,7 +61,7 @@ class _Listing(NamedTuple):
 
 def print_comparison(comparison: Comparison) -> None:
     """The tables and what must be known beside them, on standard output; on a narrow screen blocks in their place."""
-    screen = Screen()
+    screen = console()
     for listing in _listings(comparison, _SHOWN_DIFFERENCES):
         screen.print(listing.caption, overflow="fold")
         print_table(screen, listing.columns, listing.rows)

@@ -26,6 +26,7 @@ from gacrl.evaluation.statistics import difference, estimate
 from gacrl.experiments.study import claim_folder
 from gacrl.report import figures
 from gacrl.report.page import Page
+from gacrl.report.screen import Pace
 from gacrl.training import build
 from gacrl.training.devices import shard_seeds, stack_seeds
 from gacrl.training.divergence import not_finite
@@ -156,10 +157,14 @@ def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | No
     if together is None:
         together = 3 * jax.local_device_count() if jax.default_backend() == "cpu" else len(members)
     trainer = build.make_trainer(replace(grid.config, num_seeds=together))
-    scores = _train_missing(grid, trainer, members, out, say)
+    finals = -(-2 * len(grid.fresh_seeds) // together)
+    scores = _train_missing(grid, trainer, members, out, say, finals)
     means = {point: float(np.mean([scores[Member(point, seed)] for seed in grid.seeds])) for point in grid.points}
     winner = max(means, key=lambda point: means[point])
-    say(f"best: {winner}; trained again on fresh seeds beside the paper's choice")
+    say(
+        f"best: {winner} (ε₀: share of random actions at the start, τ₀: temperature of messages at the start); trained "
+        "again on fresh seeds beside the paper's choice"
+    )
     finalists = list(dict.fromkeys([winner, grid.choice]))
     again = [Member(point, seed) for point in finalists for seed in grid.fresh_seeds]
     scores = _train_missing(grid, trainer, again, out, say)
@@ -198,24 +203,33 @@ def expected_range(count: int) -> float:
 
 
 def _train_missing(
-    grid: Grid, trainer: Trainer, members: Sequence[Member], out: Path, say: Callable[[str], None]
+    grid: Grid, trainer: Trainer, members: Sequence[Member], out: Path, say: Callable[[str], None], more: int = 0
 ) -> Scores:
-    """The scores of all these members; those that are not in the folder yet are trained, group by group."""
+    """The scores of all these members; those that are not in the folder yet are trained, group by group.
+
+    more: groups that will come after these.
+    """
     scores = _read(out)
     missing = [member for member in members if member not in scores]
     groups = [missing[k : k + trainer.num_seeds] for k in range(0, len(missing), trainer.num_seeds)]
-    for number, group in enumerate(groups, 1):
-        say(f"group {number} of {len(groups)}: {len(group)} trainings of {grid.episodes} episodes")
-        found = dict(zip(group, _train(grid, trainer, group, say), strict=True))
+    pace = Pace(len(groups) + more)
+    for number, group in enumerate(groups):
+        say(
+            f"group {number + 1} of {len(groups)}: {len(group)} trainings side by side, {grid.episodes} episodes each"
+            + (f", the best {len(grid.fresh_seeds)} times more after that" if more and not number else "")
+        )
+        found = dict(zip(group, _train(grid, trainer, group, say, pace, number), strict=True))
         _append(out, found)
         scores |= found
     return scores
 
 
-def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[[str], None]) -> list[float]:
+def _train(
+    grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[[str], None], pace: Pace, before: int
+) -> list[float]:
     """The mean score of each member's episodes; −∞ where it diverged, since whoever then stands still scores well.
 
-    A group that is not full is filled up with its last member.
+    A group that is not full is filled up with its last member. before: groups that were trained before it.
     """
     filled = [*group, *[group[-1]] * (trainer.num_seeds - len(group))]
     states = [trainer.init_member(stream_key("training", seed), _hyper(trainer, point)) for point, seed in filled]
@@ -229,13 +243,21 @@ def _train(grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[
         episodes = jax.device_get(report.episodes)
         total += episodes.total[: len(group), place]
         ended += episodes.ended[: len(group)]
-        say(f"  episode {int(ended[0])}: shaped reward so far {np.mean(total / np.maximum(ended, 1)):.2f}")
+        left = pace.left(before + min(done + stretch, updates) / updates)
+        say(f"  {_so_far(total, ended)}; {left}")
     numbers = range(len(filled))
     replay = trainer.algorithm.replay(state.learner)
     diverged = {number for number, _, _ in not_finite(numbers, [{}] * len(filled), state.learner, replay)}
     return [
         -math.inf if number in diverged else float(total[number] / ended[number]) for number in range(len(group))
     ]
+
+
+def _so_far(total: np.ndarray, ended: np.ndarray) -> str:
+    """What the members of a group have reached: their scores, summed over so many episodes each."""
+    if not ended.all():
+        return "no episode has ended"
+    return f"episode {int(ended[0])}, mean shaped reward so far {np.mean(total / ended):.2f}"
 
 
 def _hyper(trainer: Trainer, point: Point) -> Any:

@@ -113,6 +113,10 @@ def _verdicts(page: Page, judged: Sequence[Judged]) -> None:
     page.table(
         ("where", "claim", "in the paper's own table", "verdict here", "because", "under another reading"), rows
     )
+    page.text(
+        "Differences have their 95 % interval over seeds. Detectable: the smallest difference that so many seeds would "
+        "show in 80 % of all repetitions; a smaller one may be there without being seen."
+    )
 
 
 def _readings(page: Page, judged: Sequence[Judged]) -> None:

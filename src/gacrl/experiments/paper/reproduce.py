@@ -127,7 +127,7 @@ def reproduce(
     asked = {"seeds": seeds, "episodes": episodes}
     claim_folder(out, "reproduce.json", asked, "reproduction", _asked_before)
     refuse_other_settings(runs)
-    watch.planned([run.name for run in runs])
+    watch.planned({run.name: "" for run in runs})
     if not train_missing(runs, watch):
         return None
     watch.say("playing random, noop and oracle at the difficulty of every stretch")

@@ -30,6 +30,11 @@ COLUMNS = {
     "distance_agent_landmark": "Min Dist",
     "near_agents": "Coll.",
 }
+MEANING = (
+    "Sh. Reward and Raw Rew.: the paper's shaped reward and MPE2's own, a step; Cov.: share of landmarks with an agent "
+    "within θ, or 0.1; Min Dist: from an agent to its nearest landmark; Coll.: share of agents with another within 0.2"
+)
+"""Of the columns, in words."""
 REFERENCE_EPISODES = 320
 """Episodes of each scripted policy for a row."""
 
