@@ -70,7 +70,7 @@ def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():
     def alone(agent: int):
         """What one agent knows before anything is said: all other rows are noise."""
         features = jax.random.normal(key, seen.features.shape).at[agent].set(seen.features[agent])
-        hidden = network.torso(seen._replace(features=features))[agent][None]
+        hidden = network.torso(seen._replace(features=features)).hidden[agent][None]
         z, hidden, _ = code(hidden, None)
         return z, hidden
 

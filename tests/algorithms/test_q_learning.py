@@ -38,7 +38,7 @@ class Table(AgentNetwork):
     remembers: bool = eqx.field(static=True)
 
     def __init__(self, remembers: bool):
-        self.torso = self.code = self.memory = self.communication = self.head = None  # type: ignore
+        self.torso = self.code = self.memory = self.communication = self.look = self.head = None  # type: ignore
         self.radius, self.scale, self.remembers = 0.0, jnp.ones(1), remembers
 
     def initial_memory(self, num_agents: int) -> Any:

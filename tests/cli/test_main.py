@@ -255,7 +255,7 @@ def test_a_run_folder_without_its_settings_or_with_broken_ones_is_refused(copy: 
 
 def test_members_that_are_not_there_are_refused(tiny_run: TinyRun, refused: Callable[..., str]):
     assert "has the members 0 to 1: there is no @2" in refused("evaluate", f"{tiny_run.folder}@2")
-    assert "leave --num-agents out" in refused("evaluate", tiny_run.folder, "--num-agents", 4)
+    assert "leave num_agents out" in refused("evaluate", tiny_run.folder, "--num-agents", 4)
 
 
 def test_a_damaged_checkpoint_is_passed_over_and_none_is_refused(

@@ -350,6 +350,35 @@ class Ablate:
 
 
 @dataclass(frozen=True)
+class Talk:
+    """Train silent, talking and told agents on a task, and say whether it needs talk and whether the agents use it.
+
+    The three are equally large and train for equally many steps; told agents hear all that their neighbours see. Then
+    the talking ones play with their messages silenced, scrambled and delayed. Stopped or killed, the same command
+    resumes with what is missing.
+
+    examples:
+      gacrl talk --env reference
+      gacrl talk --env examples/own_task.py:Beacon --env-steps 10000
+      gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
+    """
+
+    preset: str = "gacrl"
+    """The preset that trains all three."""
+    seeds: int = 3
+    """Seeds of each."""
+    seed: int = 0
+    """The first of them."""
+    env_steps: int = 40_000
+    """Environment steps of each seed."""
+    outside: ON_TASK = Outside()
+    out: Path | None = None
+    """The folder of the runs and the report; by default runs/talk-TASK."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Sweep:
     """Search settings: a file of ranges, or the paper's grid. Stopped or killed, the same command goes on.
 

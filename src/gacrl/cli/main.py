@@ -6,7 +6,6 @@ Nothing heavy is imported before a command is known: `gacrl --help` answers at o
 import contextlib
 import json
 import os
-import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, fields, replace
@@ -14,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
-from gacrl.cli import output, stopwatch
+from gacrl.cli import output, stopwatch, studies
+from gacrl.cli.stopping import stopping
+from gacrl.cli.words import Words
 from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
@@ -23,12 +24,7 @@ from gacrl.errors import UserError, full_memory, reason
 from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
-    from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume, Sweep
-    from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
-    from gacrl.experiments.ablate import Ablation
-    from gacrl.experiments.paper.reproduce import Reproduction
-    from gacrl.experiments.search import Search
-    from gacrl.experiments.study import Watch
+    from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
     from gacrl.types import Intervention
@@ -45,6 +41,7 @@ usage: gacrl COMMAND [OPTIONS]
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
+  talk       does a task need talk, and do the agents use it
   sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
   tasks      what can be trained on; a task of your own is --env FILE.py:NAME
   presets    what can be trained by name
@@ -118,18 +115,12 @@ def _at_home(word: str) -> str:
     return os.path.expanduser(word)  # noqa: PTH111
 
 
-class _Words(list[str]):
-    """The words of a command, without --env NAME and --use FILE; `task` is the name that --env gave."""
-
-    task: str | None = None
-
-
 def _run(command: str, words: list[str]) -> int:
     """Run a command, with the task and the files that come from outside at hand.
 
     What code of theirs raises is told with its file and line.
     """
-    rest, named = _Words(), {"--env": [], "--use": []}
+    rest, named = Words(), {"--env": [], "--use": []}
     following = iter(words)
     for word in following:
         flag, equals, value = word.partition("=")
@@ -168,7 +159,7 @@ def _bring(name: str, blame: contextlib.ExitStack) -> str:
     return task
 
 
-def _train(words: _Words) -> int:
+def _train(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     base = arguments.Settings.of(_base_settings(words))
@@ -263,7 +254,7 @@ def _watched(work: Callable[["Watcher"], "Ended"], as_json: bool, config: RunCon
     devices.prepare_jax(-(-config.num_seeds // place.count))
     with (
         TerminalWatcher(quiet=place.process > 0) as terminal,
-        _stopping(terminal),
+        stopping(terminal),
         distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
     ):
         run = work(watcher)
@@ -273,23 +264,7 @@ def _watched(work: Callable[["Watcher"], "Ended"], as_json: bool, config: RunCon
     return 0 if run.summary is not None else terminal.exit_code
 
 
-@contextlib.contextmanager
-def _stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
-    """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
-
-    def handler(number: int, frame: Any) -> None:
-        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-        terminal.request_stop(128 + number)
-
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
-
-
-def _base_settings(words: _Words) -> RunConfig:
+def _base_settings(words: Words) -> RunConfig:
     """The settings under the flags: the preset's, then those of --config; both change what --help shows."""
     named: dict[str, str] = {}
     for word, following in zip(words, [*words[1:], ""], strict=False):
@@ -351,7 +326,7 @@ def _intervention(asked: "Messages") -> "Intervention | None":
         return interventions.parse(words)
 
 
-def _evaluate(words: _Words) -> int:
+def _evaluate(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     asked, rest = parsing.parse_known(arguments.Evaluate, words, "evaluate")
@@ -378,7 +353,7 @@ def _evaluate(words: _Words) -> int:
     return 0
 
 
-def _render(words: _Words) -> int:
+def _render(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     asked, rest = parsing.parse_known(arguments.Render, words, "render")
@@ -449,103 +424,6 @@ def _compare(words: list[str]) -> int:
     return 0
 
 
-def _reproduce(words: list[str]) -> int:
-    from gacrl.cli import arguments, parsing
-
-    asked = parsing.parse(arguments.Reproduce, words, "reproduce")
-    from gacrl.training.devices import prepare_jax
-
-    prepare_jax(max(asked.seeds, 1))
-    from gacrl.experiments.paper import reproduce
-
-    def study(watch: "Watch") -> "Reproduction | None":
-        return reproduce.reproduce(asked.out, asked.seeds, asked.episodes, asked.extended, watch)
-
-    return _studied(study, asked.out, asked.json)
-
-
-def _studied(
-    study: Callable[["Watch"], "Ablation | Reproduction | Search | None"], out: Path, as_json: bool
-) -> int:
-    """Make a study of many runs under the eyes of the terminal; Ctrl-C ends as in training."""
-    from gacrl.cli.terminal import RunsWatcher
-    from gacrl.experiments.study import Watch
-
-    with RunsWatcher() as terminal, _stopping(terminal):
-        done = study(Watch(terminal.planned, terminal.watcher, terminal.finished, terminal.say))
-    if done is None:
-        print(f"stopped; the same command goes on with what is missing in {out}")
-        return terminal.exit_code
-    print(f"report     {done.report}")
-    if as_json:
-        print(json.dumps(done.to_dict()))
-    return 0
-
-
-def _ablate(words: _Words) -> int:
-    from gacrl.cli import arguments, parsing
-
-    asked = parsing.parse(arguments.Ablate, words, "ablate")
-    from gacrl.training.devices import prepare_jax
-
-    prepare_jax(max(asked.seeds, 1))
-    from gacrl.experiments import ablate
-
-    def study(watch: "Watch") -> "Ablation | None":
-        config = replace(presets.preset(asked.preset), seed=asked.seed)
-        config = config if words.task is None else configuration.on_task(config, words.task)
-        return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
-
-    return _studied(study, asked.out, asked.json)
-
-
-def _sweep(words: _Words) -> int:
-    from gacrl.cli import arguments, parsing
-
-    asked = parsing.parse(arguments.Sweep, words, "sweep")
-    out = asked.out or Path("runs") / Path(asked.spec).stem
-    if asked.spec != "paper-grid":
-        return _search(asked, out, words.task)
-    if words.task is not None:
-        raise UserError("paper-grid is the paper's, on its own task: leave --env out")
-    if asked.ray is not None:
-        raise UserError("paper-grid is one compiled program and needs no cluster: leave --ray out")
-    seeds = 2 if asked.seeds is None else asked.seeds
-    from gacrl.training.devices import prepare_jax
-
-    prepare_jax(27 * max(seeds, 1))
-    from gacrl.experiments.paper import grid as sweep
-
-    grid = sweep.paper_grid(seeds, 500 if asked.episodes is None else asked.episodes)
-    done = sweep.sweep(grid, out, say=lambda line: print(line, flush=True))
-    print(f"report     {done.report}")
-    if asked.json:
-        print(json.dumps(done.to_dict()))
-    return 0
-
-
-def _search(asked: "Sweep", out: Path, task: str | None) -> int:
-    """A search that a file describes, here or on a cluster."""
-    if asked.seeds is not None or asked.episodes is not None:
-        raise UserError(f"--seeds and --episodes are for paper-grid: say seeds and env_steps in {asked.spec}")
-    if asked.trial_cpus <= 0 or asked.trial_gpus < 0:
-        raise UserError("--trial-cpus must be above 0, and --trial-gpus not below it")
-    from gacrl.experiments import search
-    from gacrl.training.devices import prepare_jax
-
-    spec = search.load(Path(asked.spec), task)
-    prepare_jax(spec.config.num_seeds)
-
-    def study(watch: "Watch") -> "search.Search | None":
-        if asked.ray is None:
-            return search.search(spec, out, watch)
-        from gacrl.experiments.ray_search import ray_search
-
-        return ray_search(spec, out, asked.ray, asked.trial_cpus, asked.trial_gpus, watch)
-
-    return _studied(study, out, asked.json)
-
-
 def _presets(words: list[str]) -> int:
     from gacrl.cli import arguments, parsing
 
@@ -572,7 +450,7 @@ def _tasks(words: list[str]) -> int:
     return 0
 
 
-def _config(words: _Words) -> int:
+def _config(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     asked = parsing.parse(arguments.Config, words, "config")
@@ -611,13 +489,14 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "evaluate": _evaluate,
     "render": _render,
     "compare": _compare,
-    "reproduce": _reproduce,
-    "ablate": _ablate,
-    "sweep": _sweep,
+    "reproduce": studies.reproduce,
+    "ablate": studies.ablate,
+    "talk": studies.talk,
+    "sweep": studies.sweep,
     "tasks": _tasks,
     "presets": _presets,
     "config": _config,
     "doctor": _doctor,
 }
-_ON_TASK = ("train", "resume", "evaluate", "render", "compare", "ablate", "sweep", "tasks", "config")
+_ON_TASK = ("train", "resume", "evaluate", "render", "compare", "ablate", "talk", "sweep", "tasks", "config")
 """Commands that take a task from outside."""

@@ -231,7 +231,7 @@ def _report(done: Talk) -> Page:
     page.table(
         ("learner", "what agents hear", "parameters", "return per agent", "every seed"),
         [
-            [name, _HEARD[name], f"{done.parameters[name]:,}", *_cells(values)]
+            [name, _HEARD[name], f"{done.parameters[name]:,}", *cells(values)]
             for name, values in done.returns.items()
         ],
         f"{config.preset} on {done.task.name}: {config.training.env_steps:,} environment steps a seed, "
@@ -241,7 +241,7 @@ def _report(done: Talk) -> Page:
     )
     page.table(
         ("messages", "return per agent", "every seed"),
-        [[name, *_cells(values)] for name, values in done.played.items()],
+        [[name, *cells(values)] for name, values in done.played.items()],
         "The same talking agents, by what happens to their messages. Scrambled: every agent is heard with its words "
         "from another episode.",
     )
@@ -268,5 +268,6 @@ def _report(done: Talk) -> Page:
     return page
 
 
-def _cells(values: NDArray[np.float64]) -> list[str]:
+def cells(values: NDArray[np.float64]) -> list[str]:
+    """Write the mean of seeds with its interval, and every seed."""
     return [with_interval(estimate(values, mean), ".2f"), " ".join(f"{value:.2f}" for value in values)]

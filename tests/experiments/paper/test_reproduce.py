@@ -453,7 +453,7 @@ def test_the_command_writes_a_report_that_has_every_claim(
         (["--out", "{tmp}/other"], "{tmp}/other exists and holds no reproduction: choose another --out"),
         (["--out", "{tmp}/mine"], "{tmp}/mine holds a reproduction with --seeds 3 and --episodes 9: ask for the same, or choose another --out"),
         (["--out", "{tmp}/cut"], "{tmp}/cut/reproduce.json is damaged: choose another --out"),
-        (["--seed", "3"], "unrecognized options: --seed, 3: did you mean --seeds?"),
+        (["--seed", "3"], "unrecognized option --seed: did you mean --seeds?"),
     ],
 )  # fmt: skip
 def test_mistakes_end_in_one_sentence(
