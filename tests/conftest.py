@@ -54,6 +54,13 @@ def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, 
         yield environment
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs() -> Iterator[None]:
+    """The compiled programs of a module leave the memory with it: all of them together took 7 GB in each worker."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Types are not checked at run time, as users call: what is wrong comes to our own checks."""

@@ -39,7 +39,8 @@ class Table(AgentNetwork):
 
     def __init__(self, remembers: bool):
         self.torso = self.code = self.memory = self.communication = self.look = self.head = None  # type: ignore
-        self.radius, self.scale, self.remembers = 0.0, jnp.ones(1), remembers
+        self.radius, self.nearest, self.sight = 0.0, None, ENV.sight
+        self.scale, self.remembers = jnp.ones(1), remembers
 
     def initial_memory(self, num_agents: int) -> Any:
         return AgentMemory(jnp.zeros((num_agents, 1)), ()) if self.remembers else ()

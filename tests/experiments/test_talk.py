@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from gacrl.config import files as configuration
-from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.experiments import talk
 from gacrl.experiments.talk import LEARNERS, SCRAMBLED, SENT, SILENT, TALKING, TOLD
@@ -82,18 +81,17 @@ def test_what_cannot_talk_is_refused(tmp_path: Path):
     assert not list(tmp_path.iterdir()), "nothing is made for what is refused"
 
 
-def short(config: RunConfig) -> RunConfig:
-    return configuration.from_dict(
-        {
-            "algorithm": {"updates": 1, "batch_size": 8, "replay_capacity": 500, "network": {"width": 8}},
-            "evaluation": {"num_episodes": 4, "final_episodes": 8},
-        },
-        config,
-    )
+SMALL = configuration.from_dict(
+    {
+        "algorithm": {"updates": 1, "batch_size": 8, "replay_capacity": 500, "learning_starts": 0},
+        "evaluation": {"num_episodes": 4, "final_episodes": 8},
+    },
+    configuration.on_task(configuration.preset("vdn", **{"algorithm.network.width": 8}), "reference"),
+)
 
 
 def test_a_study_trains_three_learners_and_plays_one_of_them_in_four_ways(tmp_path: Path):
-    done = talk.talk(short(ON_REFERENCE), tmp_path / "study", seeds=2, env_steps=400)
+    done = talk.talk(SMALL, tmp_path / "study", seeds=2, env_steps=512)
     assert done is not None
     summary = json.loads((tmp_path / "study" / "summary.json").read_text())
     assert summary["sentence"] == done.sentence
@@ -103,5 +101,5 @@ def test_a_study_trains_three_learners_and_plays_one_of_them_in_four_ways(tmp_pa
     assert set(summary["played"]) == {"as sent", "silenced", "scrambled", "a step late"}
     assert summary["played"]["as sent"] == summary["returns"]["talking"]
     assert "Does reference need talk?" in done.report.read_text(encoding="utf-8")
-    again = talk.talk(short(ON_REFERENCE), tmp_path / "study", seeds=2, env_steps=400)
+    again = talk.talk(SMALL, tmp_path / "study", seeds=2, env_steps=512)
     assert again is not None and again.to_dict() == done.to_dict(), "nothing is trained again"

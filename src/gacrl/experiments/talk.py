@@ -222,7 +222,8 @@ def _read(out: Path, runs: Sequence[Planned]) -> Talk:
 
 def _returns(run: str, episodes: int, intervention: str = "") -> NDArray[np.float64]:
     """The return of each seed [S], greedy."""
-    return scoring.play(run, episodes, intervention=interventions.parse(intervention))[HEADLINE].mean(1)
+    played = scoring.play(run, episodes, intervention=interventions.parse(intervention))
+    return np.asarray(played[HEADLINE].mean(1), float)
 
 
 def _report(done: Talk) -> Page:
