@@ -95,6 +95,8 @@ class NetworkConfig:
     """A narrow code of what the agent sees, which its symbols are made of: none, a code, or a Gaussian."""
     latent_size: int = 16
     """Numbers of the code."""
+    latent_use: Literal["sample", "mean"] = "sample"
+    """What agents act and speak on while learning: a sample of the Gaussian code, as in the paper, or its mean."""
     communication: str = "none"
     """What agents send: none, commnet (averages of hidden states), ic3net (the same, through a gate), tarmac (values
     that receivers ask for), dial (regularised units), discrete or soft (Gumbel-Softmax symbols, one-hot when played or

@@ -60,10 +60,11 @@ class Code(eqx.Module):
     decode: Linear
     merge: Linear
     gaussian: bool = eqx.field(static=True)
+    hears_mean: bool = eqx.field(static=True)
 
     def __init__(self, config: NetworkConfig, key: PRNGKey):
         encode_key, decode_key, merge_key = jax.random.split(key, 3)
-        self.gaussian = config.latent == "vae"
+        self.gaussian, self.hears_mean = config.latent == "vae", config.latent_use == "mean"
         size = config.latent_size
         self.encode = Linear(config.width, 2 * size if self.gaussian else size, encode_key)
         self.decode = Linear(size, config.width, decode_key)
@@ -72,14 +73,19 @@ class Code(eqx.Module):
     def __call__(
         self, hidden: Float[Array, "N H"], key: PRNGKey | None
     ) -> tuple[Float[Array, "N Z"], Float[Array, "N H"], Float[Array, " N"]]:
-        """Returns z, the vector that knows of it, and the code's loss. Without a key z is the mean."""
+        """Return the code that agents act and speak on, the vector that knows of it, and the code's loss.
+
+        Without a key the code is the mean. With one it is a sample, or the mean again where `latent_use` says so: the
+        sample then serves the reconstruction alone.
+        """
         divergence = 0.0
         if self.gaussian:
             mean, log_variance = jnp.split(self.encode(hidden), 2, axis=-1)
             noise = 0.0 if key is None else jax.random.normal(key, mean.shape)
-            code = sample_latent(mean, log_variance, noise * jnp.ones_like(mean))
+            sample = sample_latent(mean, log_variance, noise * jnp.ones_like(mean))
+            code = mean if self.hears_mean else sample
             divergence = kl_divergence(mean, log_variance)
         else:
-            code = self.encode(hidden)
-        error = jnp.square(self.decode(code) - jax.lax.stop_gradient(hidden)).sum(-1)
+            sample = code = self.encode(hidden)
+        error = jnp.square(self.decode(sample) - jax.lax.stop_gradient(hidden)).sum(-1)
         return code, hidden + jax.nn.relu(self.merge(code)), 0.5 * error + divergence

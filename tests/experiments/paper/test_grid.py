@@ -47,7 +47,7 @@ def test_it_goes_on_with_what_is_missing_and_its_numbers_are_those_of_single_run
     done = sweep.sweep(grid, tmp_path / "out", said.append, together=2)
     assert [line for line in said if line.startswith("group")][:2] == [
         "group 1 of 4: 2 trainings side by side, 4 episodes each, the best 2 times more after that",
-        "group 2 of 4: 2 trainings side by side, 4 episodes each, the best 2 times more after that",
+        "group 2 of 4: 2 trainings side by side, 4 episodes each",
     ]
     assert done.winner == max(done.means, key=lambda point: done.means[point])
     assert set(done.confirmed) == {done.winner, grid.choice}
