@@ -128,6 +128,27 @@ _GACRL_TEAMS = _gacrl(
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
 
+# Where something has to be said: a second look for what was heard, soft and almost noiseless words that say who spoke,
+# one conversation, and less exploring at first, as docs/log.md came to it.
+_GACRL_TALK = _gacrl(
+    "gacrl-talk",
+    SpreadSettings(),
+    env_steps=60_000,
+    network=replace(
+        _GACRL_NETWORK,
+        latent_use="mean",
+        second_look=True,
+        symbols="soft",
+        symbol_noise=0.03,
+        speaker_identity=True,
+        vocabulary=16,
+    ),
+    epsilon=0.3,
+    temperature=0.1,
+    temperature_end=0.05,
+    symmetric_play=False,
+)
+
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, tuned in six trials
 # (docs/tuning). QMIX, which has VDN's settings, collapses in some seeds with them as with those of its best trial.
 _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
@@ -160,6 +181,7 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
             "GACRL for teams of any size: trained with 5 agents, each sees what is near",
             _GACRL_TEAMS,
         ),
+        "gacrl-talk": ("GACRL for tasks in which something has to be said", _GACRL_TALK),
         "graph-vdn": (
             "VDN with GACRL's switches: entity graph, symmetry, coverage bonus",
             _GRAPH_VDN,
