@@ -3,7 +3,7 @@
 import contextlib
 import io
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,6 +61,12 @@ def forget_programs() -> Iterator[None]:
     jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is printed is as wide as in a log, wherever the tests run."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Types are not checked at run time, as users call: what is wrong comes to our own checks."""
@@ -82,6 +88,16 @@ def from_outside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for registry, kept in zip(registries, before, strict=True):
         registry.clear()
         registry.update(kept)
+
+
+def soaked(cases: Iterable[Any], *kept: Any) -> list[Any]:
+    """The cases, all of them soaked except those that are kept: each compiles programs of its own."""
+    return [
+        pytest.param(
+            *(case if isinstance(case, tuple) else (case,)), marks=[pytest.mark.soak] * (case not in kept)
+        )
+        for case in cases
+    ]
 
 
 def drawn(build: Any, *settings: Any, seed: int = 0) -> Any:

@@ -30,7 +30,7 @@ COMMANDS = [
 PYTHON = [block for language, block in BLOCKS if language == "python"]
 GUIDE = (ROOT / "docs" / "guides" / "python.md").read_text(encoding="utf-8")
 
-LONG = {"ablate", "doctor", "reproduce", "sweep"}
+LONG = {"ablate", "doctor", "reproduce", "sweep", "talk"}
 """Minutes each: the first is below, the others have tests of their own in tests/experiments."""
 
 pytestmark = pytest.mark.xdist_group("readme")

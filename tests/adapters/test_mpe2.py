@@ -58,9 +58,9 @@ def played_here(env: Any, actor: Actor, start: Any, key: PRNGKey) -> np.ndarray:
     ("name", "changes"),
     [
         ("scouts", {}),
-        ("speaker_listener", {}),
+        pytest.param("speaker_listener", {}, marks=pytest.mark.soak),
         ("speaker_listener", {"talk": "actions"}),
-        ("reference", {}),
+        pytest.param("reference", {}, marks=pytest.mark.soak),
         ("reference", {"talk": "actions"}),
     ],
 )

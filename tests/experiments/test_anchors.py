@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import soaked
 
 import gacrl
 from gacrl import tasks
@@ -25,7 +26,7 @@ def test_tasks_are_listed_with_random_silent_and_told_scores():
         assert all(f"{who} {row['scores'][who]:.2f}" in anchors.sentence(row) for who in anchors.SCORED)
 
 
-@pytest.mark.parametrize("name", TALKING)
+@pytest.mark.parametrize("name", soaked(TALKING, "scouts"))
 def test_anchors_are_what_the_scripted_policies_score(name: str):
     """As far as 512 episodes tell; trained policies may have taken their place where they are better."""
     task = tasks.find(name)

@@ -90,6 +90,7 @@ SMALL = configuration.from_dict(
 )
 
 
+@pytest.mark.soak
 def test_a_study_trains_three_learners_and_plays_one_of_them_in_four_ways(tmp_path: Path):
     done = talk.talk(SMALL, tmp_path / "study", seeds=2, env_steps=512)
     assert done is not None

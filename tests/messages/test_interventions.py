@@ -339,7 +339,7 @@ def test_agents_that_there_are_not_are_refused_in_one_sentence(text: str, strang
     for play in (evaluate, record_many):
         with pytest.raises(ConfigError) as caught:
             play(Choir(), sing, (), (), KEY, 2, interventions.parse(text))
-        sentence = f"there is no agent {stranger} to {text.split()[0]}: they are counted from 0 to 2"
+        sentence = f"{text.split()[0]}: there are the agents 0 to 2, and no agent {stranger}"
         assert re.fullmatch(sentence, str(caught.value))
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import drawn_learner
+from conftest import drawn_learner, soaked
 
 from gacrl import rollout
 from gacrl.algorithms import build as algorithms
@@ -111,7 +111,7 @@ TALKS = {
 }
 
 
-@pytest.mark.parametrize("name", TALKS)
+@pytest.mark.parametrize("name", soaked(TALKS, "discrete, delay 2", "discrete, drop 0.4", "gated, noise 0.5"))
 def test_the_first_ratio_of_ppo_is_one_whatever_arrives(name: str):
     """The agents' words are drawn. Without what arrived, the ratio is another one."""
     network, text = TALKS[name]
@@ -154,13 +154,16 @@ def setup_of(algorithm: Algorithm) -> Any:
     return algorithm.init.args[0]
 
 
+REPLAYED = [
+    *(("gacrl", text) for text in EVERY),
+    *(("gacrl, recurrent", text) for text in ("silence 1", "delay 2")),
+    *(("dial", text) for text in ("swap 0 2", "drop 0.4", "delay 2")),
+]
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
-    [
-        *(("gacrl", text) for text in EVERY),
-        *(("gacrl, recurrent", text) for text in ("silence 1", "delay 2")),
-        *(("dial", text) for text in ("swap 0 2", "drop 0.4", "delay 2")),
-    ],
+    soaked(REPLAYED, ("gacrl", "swap 0 2"), ("gacrl, recurrent", "delay 2"), ("dial", "drop 0.4")),
 )
 def test_the_replay_of_q_learning_holds_what_arrived_and_windows_hear_it(name: str, text: str):
     """Windows that are read back say the values that the agents acted on; nothing is drawn here."""
@@ -216,7 +219,7 @@ SILENCED = {
 }
 
 
-@pytest.mark.parametrize("name", SILENCED)
+@pytest.mark.parametrize("name", soaked(SILENCED, "gacrl", "mappo"))
 def test_to_train_in_silence_is_to_train_where_no_edge_is(name: str):
     """Six updates: the same weights and metrics. With words they are others."""
 
@@ -240,7 +243,7 @@ def test_to_train_in_silence_is_to_train_where_no_edge_is(name: str):
 PAPER = GacrlPaperConfig(batch_size=5, replay_capacity=100, epsilon=0.0, epsilon_end=0.0, epsilon_bonus=0.0)
 
 
-@pytest.mark.parametrize("text", EVERY)
+@pytest.mark.parametrize("text", soaked(EVERY, "swap 0 2", "delay 2"))
 def test_the_papers_loss_is_of_the_logits_that_were_acted_on(text: str):
     """The replay's rows and the noise of acting give the words, the actions and the log-probabilities of acting."""
     trainer = build.make_trainer(trained_with(text, PAPER))

@@ -45,7 +45,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-TWINS = ("mappo", "iql", "qmix")
+TWINS = ("mappo", "iql", "qmix", "gacrl")
 """Their agents are IPPO's and VDN's. All kinds but one are soaked."""
 PAIRS = [
     pytest.param(name, kind, marks=[pytest.mark.soak] * (name in TWINS and kind != "gated"))

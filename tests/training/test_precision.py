@@ -77,6 +77,7 @@ def test_a_run_goes_on_in_either_precision(tmp_path: Path):
     assert [row["env_steps"] for row in rows] == [20, 40, 60, 80]
 
 
+@pytest.mark.soak
 def test_a_policy_trained_in_single_precision_plays_alike_in_double():
     def greedy() -> float:
         scores = scoring.score_run("pretrained:gacrl", 16)

@@ -15,7 +15,7 @@ def bits_used(episodes: Sequence[Episode]) -> float | None:
     """
     counts = None
     for episode in episodes:
-        if episode.messages is None or not _symbols(episode.messages):
+        if episode.messages is None or not _symbols(episode.messages[:, -1]):
             return None
         spoken = episode.messages[:, -1][episode.agent_mask].sum(0)
         counts = spoken if counts is None else counts + spoken

@@ -71,7 +71,7 @@ def test_it_goes_on_with_what_is_missing_and_its_numbers_are_those_of_single_run
     results.write_text("".join(lines[:3]) + "".join(lines[4:])[:-9], encoding="utf-8")  # one lost, one cut off
     said.clear()
     again = sweep.sweep(grid, tmp_path / "out", said.append, together=2)
-    assert "group 1 of 1: 1 trainings of 4 episodes" in said
+    assert "group 1 of 1: 1 trainings side by side, 4 episodes each" in said
     assert again.means == pytest.approx(done.means)
     assert again.to_dict()["winner"] == done.to_dict()["winner"]
     with results.open("ab") as file:  # what is no result: other bytes, no number; and one that diverged
