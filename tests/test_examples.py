@@ -54,6 +54,7 @@ def silenced(folder: Path) -> float:
     return float(np.mean(jax.jit(play)()["return_agent_mean"]))
 
 
+@pytest.mark.soak
 def test_a_task_of_your_own_is_solved_by_talking_alone(tmp_path: Path, example: Callable[[str], Any]):
     """The default preset, with its discrete symbols; silenced it is no better than a policy that never heard a word."""
     assert len((ROOT / "examples" / "own_task.py").read_text().splitlines()) <= 60
@@ -99,6 +100,7 @@ def test_messages_of_your_own(example: Callable[[str], Any], tmp_path: Path, mon
     assert row["update"]["loss_messages"] > 0
 
 
+@pytest.mark.soak
 def test_exploration_of_your_own(example: Callable[[str], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A learner from replay and one on-policy take it; the share of random actions is what the rule says."""
     few(monkeypatch)

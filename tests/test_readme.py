@@ -119,6 +119,7 @@ def test_the_python_of_the_readme(room):
     assert names["policy"](observations).shape == (3,)
 
 
+@pytest.mark.soak
 def test_the_python_of_its_guide(room, capsys):
     """Block after block, in one session that begins with the first: five lines train, evaluate in silence, and plot."""
     blocks = re.findall(r"```python\n(.*?)```", GUIDE, flags=re.DOTALL)

@@ -91,6 +91,7 @@ GROWING = RunConfig(
 )
 
 
+@pytest.mark.soak
 def test_a_team_grows_within_one_program():
     trainer = build.make_trainer(GROWING)
     state = trainer.init((0,))

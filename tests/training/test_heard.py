@@ -308,6 +308,7 @@ SHORT = [
 ]
 
 
+@pytest.mark.soak
 def test_a_run_with_words_on_their_way_resumes_with_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Interrupted in the middle of episodes: what was said before and has not arrived is in the checkpoint."""
     words = ["train", *SHORT, "--training.intervention", "delay 3"]

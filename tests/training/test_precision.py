@@ -61,6 +61,7 @@ def test_starts_are_the_same(env: Environment):
     np.testing.assert_allclose(double.landmarks, single.landmarks, rtol=1e-6)
 
 
+@pytest.mark.soak
 def test_a_run_goes_on_in_either_precision(tmp_path: Path):
     """Trained in double, resumed in single, and again in double; the shipped policies were trained in single."""
     config = configuration.from_dict(TINY, presets.preset("ippo"))

@@ -72,6 +72,7 @@ def test_who_is_absent_is_absent_and_the_blind_are_there_first():
     np.testing.assert_array_equal(np.asarray(things.agent_mask).sum(1), [1, 1, 0, 0])
 
 
+@pytest.mark.soak
 def test_floors_and_ceilings():
     played = {
         who: references.play_scripted(who, "scouts", ScoutsSettings(), 512) for who in ("random", "silent", "told")
