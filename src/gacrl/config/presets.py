@@ -128,8 +128,8 @@ _GACRL_TEAMS = _gacrl(
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
 
-# Where something has to be said: a second look for what was heard, soft and almost noiseless words that say who spoke,
-# one conversation, and less exploring at first, as docs/log.md came to it.
+# Where something has to be said: a second look for what was heard, soft words without noise, one conversation, a
+# shorter horizon and less exploring at first, as docs/log.md came to it.
 _GACRL_TALK = _gacrl(
     "gacrl-talk",
     SpreadSettings(),
@@ -139,10 +139,10 @@ _GACRL_TALK = _gacrl(
         latent_use="mean",
         second_look=True,
         symbols="soft",
-        symbol_noise=0.03,
-        speaker_identity=True,
+        symbol_noise=0.0,
         vocabulary=16,
     ),
+    gamma=0.8,
     epsilon=0.3,
     temperature=0.1,
     temperature_end=0.05,
