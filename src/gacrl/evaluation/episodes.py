@@ -186,6 +186,19 @@ def recorded_bytes(env: Environment, params: EnvParams, num_episodes: int, look:
     return int(env.max_cycles) * num_episodes * (shown + acted + heard + single * agents)
 
 
+class _Played(NamedTuple):
+    """Up to the time limit, episodes side by side; what follows `done` belongs to the next episode."""
+
+    scene: Scene | None
+    actions: Int[Array, "T E N"] | Float[Array, "T E N A"]
+    messages: Float[Array, "T E R N V"] | None
+    adjacency: Bool[Array, "T E N N"] | None
+    reward: Float[Array, "T E N"]
+    reward_raw: Float[Array, "T E"]
+    done: Bool[Array, "T E"]
+    agent_mask: Bool[Array, "T E N"]
+
+
 def record_many(
     env: Environment,
     policy: Policy,
@@ -201,16 +214,6 @@ def record_many(
     look: what is to be seen of a state; without it discs, where the task says where its agents are.
     """
 
-    def view(state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
-        """Of each environment [E, …]."""
-        if look is not None:
-            return jax.vmap(look, (0, None))(state, params)
-        if observation.positions is None:
-            return None
-        return jax.vmap(lambda place, there: compose(discs(place, 0.0, there)))(
-            observation.positions, observation.agent_mask
-        )
-
     @jax.jit
     def play(memory: Memory, params: EnvParams, key: PRNGKey) -> _Played:
         def one_step(
@@ -218,12 +221,12 @@ def record_many(
         ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
             keys = jax.random.split(key, (num_episodes, 3))
             after, step = rollout.act(env, policy, params, carry, keys, intervention)
-            seen = view(after.env_state, step.next_observation, params)
+            seen = _view(look, after.env_state, step.next_observation, params)
             return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
 
         start_key, act_key = jax.random.split(key)
         carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
-        opening = view(carry.env_state, carry.observation, params)
+        opening = _view(look, carry.env_state, carry.observation, params)
         _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
         scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
         return _Played(
@@ -239,23 +242,36 @@ def record_many(
 
     played = jax.device_get(play(initial_memory, params, typed_keys(key)))
 
-    def one(k: int) -> Episode:
-        steps = int(played.done[:, k].argmax()) + 1  # the time limit ends what nothing else has ended
+    return [_episode(played, k) for k in range(num_episodes)]
 
-        def rows(array: np.ndarray | None, count: int = steps) -> np.ndarray | None:
-            return None if array is None else np.array(array[:count, k])
 
-        return Episode(
-            actions=np.array(played.actions[:steps, k]),
-            messages=rows(played.messages),
-            adjacency=rows(played.adjacency),
-            reward=np.array(played.reward[:steps, k]),
-            reward_raw=np.array(played.reward_raw[:steps, k]),
-            agent_mask=np.array(played.agent_mask[:steps, k]),
-            scene=_sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
-        )
+def _view(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
+    """Return what is to be seen of each environment [E, …]: discs where nobody says how to look."""
+    if look is not None:
+        return jax.vmap(look, (0, None))(state, params)
+    if observation.positions is None:
+        return None
+    return jax.vmap(lambda place, there: compose(discs(place, 0.0, there)))(
+        observation.positions, observation.agent_mask
+    )
 
-    return [one(k) for k in range(num_episodes)]
+
+def _episode(played: _Played, k: int) -> Episode:
+    """Cut the k-th of the episodes that were played side by side, up to its end."""
+    steps = int(played.done[:, k].argmax()) + 1  # the time limit ends what nothing else has ended
+
+    def rows(array: Any, count: int = steps) -> np.ndarray | None:
+        return None if array is None else np.array(array[:count, k])
+
+    return Episode(
+        actions=np.array(played.actions[:steps, k]),
+        messages=rows(played.messages),
+        adjacency=rows(played.adjacency),
+        reward=np.array(played.reward[:steps, k]),
+        reward_raw=np.array(played.reward_raw[:steps, k]),
+        agent_mask=np.array(played.agent_mask[:steps, k]),
+        scene=_sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
+    )
 
 
 def _sized(scene: Scene | None) -> Scene | None:
@@ -265,16 +281,3 @@ def _sized(scene: Scene | None) -> Scene | None:
     places = scene.agents.positions.reshape(-1, 2)
     size = max(float(np.ptp(places, axis=0).max(initial=0.0)), 1e-6) / 20
     return scene._replace(agents=scene.agents._replace(radius=np.full_like(scene.agents.radius, size)))
-
-
-class _Played(NamedTuple):
-    """Up to the time limit, episodes side by side; what follows `done` belongs to the next episode."""
-
-    scene: Scene | None
-    actions: Int[Array, "T E N"] | Float[Array, "T E N A"]
-    messages: Float[Array, "T E R N V"] | None
-    adjacency: Bool[Array, "T E N N"] | None
-    reward: Float[Array, "T E N"]
-    reward_raw: Float[Array, "T E"]
-    done: Bool[Array, "T E"]
-    agent_mask: Bool[Array, "T E N"]
