@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")  # compiles in half the time
 
+os.environ.pop("COLUMNS", None)  # what is printed is as wide as in a log, wherever the tests run
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,12 +68,6 @@ def forget_programs() -> Iterator[None]:
     pages = int(in_use.read_text().split()[1]) if in_use.exists() else _MANY_PAGES
     if pages >= _MANY_PAGES:
         jax.clear_caches()
-
-
-@pytest.fixture(autouse=True)
-def no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is printed is as wide as in a log, wherever the tests run."""
-    monkeypatch.delenv("COLUMNS", raising=False)
 
 
 @pytest.fixture

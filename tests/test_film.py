@@ -13,8 +13,7 @@ from test_render import world
 from gacrl import film, render
 from gacrl.errors import UserError
 
-FFMPEG = """#!{python}
-import json, sys
+FFMPEG = """import json, sys
 words = sys.argv[1:]
 if {fails}:
     print("Unknown encoder", file=sys.stderr)
@@ -32,7 +31,8 @@ def ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def make(fails: bool = False) -> None:
         path = tmp_path / "bin" / "ffmpeg"
         path.parent.mkdir(exist_ok=True)
-        path.write_text(FFMPEG.format(python=sys.executable, fails=fails))
+        path.with_suffix(".py").write_text(FFMPEG.format(fails=fails))
+        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$0.py" "$@"\n')
         path.chmod(path.stat().st_mode | stat.S_IEXEC)
         monkeypatch.setenv("PATH", str(path.parent), prepend=os.pathsep)
 

@@ -66,7 +66,7 @@ def checks() -> list[Check]:
     ]
     seen: list[Trial] = []
     for name in presets.PRESETS:
-        if name.startswith("graph-"):  # learners of the others; what they see more shows only in space
+        if name.startswith(("graph-", "gacrl-")):  # learners of the others; what they see more shows only in space
             continue
         asked = trial(presets.preset(name).algorithm)
         if asked not in seen:  # presets may differ by their task alone
