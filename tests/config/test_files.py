@@ -342,3 +342,13 @@ def test_settings_of_a_task_from_outside_load_once_it_is_at_hand(monkeypatch: py
         from_dict({"env": {"name": "Market", "stals": 5}})
     with pytest.raises(ConfigError, match="there is a task 'spread' already"):
         tasks.bring(tasks.Own(Task("spread", MarketSettings, lambda settings: None), MarketSettings()))
+
+
+def test_memory_is_there_where_the_task_needs_it_and_a_file_may_say_otherwise(from_outside: None):
+    task = Task("later", SpreadSettings, lambda settings: settings, needs_memory=True)
+    tasks.bring(tasks.Own(task, SpreadSettings()))
+    assert on_task(preset("ippo"), "later").algorithm.network.recurrent  # pyright: ignore[reportAttributeAccessIssue]
+    assert not on_task(preset("ippo"), "reference").algorithm.network.recurrent  # pyright: ignore[reportAttributeAccessIssue]
+    assert on_task(preset("paper"), "later").algorithm == preset("paper").algorithm, "it has a network of its own"
+    written = {"env": {"name": "later"}, "algorithm": {"network": {"recurrent": False}}}
+    assert not from_dict(written, preset("ippo")).algorithm.network.recurrent  # pyright: ignore[reportAttributeAccessIssue]

@@ -31,9 +31,20 @@ class CommNet(Communication):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        said = []
-        for number, (own, heard) in enumerate(zip(self.own, self.heard, strict=True)):
-            said.append(hidden)
-            told = received(hidden, near, number, len(self.own))
-            hidden = jnp.tanh(own(hidden) + heard(neighbour_mean(told, near.adjacency)))
-        return Spoken(hidden, jnp.stack(said))
+        return averaging_rounds(hidden, near, self.own, self.heard)
+
+
+def averaging_rounds(
+    hidden: Float[Array, "N H"],
+    near: Neighbourhood,
+    own: tuple[Linear, ...],
+    heard: tuple[Linear, ...],
+    speaks: Float[Array, "N 1"] | None = None,
+) -> Spoken:
+    """Let agents hear the mean of their neighbours, round by round. speaks: 1 or 0 for each; None: all do."""
+    said = []
+    for number, (own_layer, heard_layer) in enumerate(zip(own, heard, strict=True)):
+        said.append(hidden if speaks is None else speaks * hidden)
+        told = received(said[-1], near, number, len(own))
+        hidden = jnp.tanh(own_layer(hidden) + heard_layer(neighbour_mean(told, near.adjacency)))
+    return Spoken(hidden, jnp.stack(said))

@@ -1,12 +1,12 @@
 """IC3Net: CommNet whose agents decide whether to speak."""
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, neighbour_mean, received
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken
+from gacrl.networks.communication.commnet import averaging_rounds
 from gacrl.networks.layers import Linear
 from gacrl.networks.messages import gumbel_sigmoid
 from gacrl.types import PRNGKey
@@ -40,11 +40,6 @@ class Ic3net(Communication):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        logit, said = self.gate(hidden), []
+        logit = self.gate(hidden)
         noise = None if key is None else jax.random.logistic(key, logit.shape)
-        speaks = gumbel_sigmoid(logit, noise, temperature)
-        for number, (own, heard) in enumerate(zip(self.own, self.heard, strict=True)):
-            said.append(speaks * hidden)
-            told = received(said[-1], near, number, len(self.own))
-            hidden = jnp.tanh(own(hidden) + heard(neighbour_mean(told, near.adjacency)))
-        return Spoken(hidden, jnp.stack(said))
+        return averaging_rounds(hidden, near, self.own, self.heard, gumbel_sigmoid(logit, noise, temperature))
