@@ -84,19 +84,19 @@ def talk(words: Words) -> int:
     """Answer whether a task needs talk, and whether the agents use it."""
     from gacrl.cli import arguments, parsing
 
-    asked = parsing.parse(arguments.Talk, words, "talk")
+    asked, rest = parsing.parse_known(arguments.Talk, words, "talk")
     if words.task is None:
         raise UserError("say on which task with --env NAME or --env FILE.py:NAME; `gacrl tasks` has ours")
-    task = words.task
+    config = configuration.on_task(replace(presets.preset(asked.preset), seed=asked.seed), words.task)
+    config = replace(config, env=parsing.changed(config.env, rest, "talk", arguments.Talk))
     from gacrl.training.devices import prepare_jax
 
     prepare_jax(max(asked.seeds, 1))
     from gacrl.experiments import talk
 
-    out = asked.out or Path("runs") / f"talk-{task}"
+    out = asked.out or Path("runs") / f"talk-{words.task}"
 
     def study(watch: "Watch") -> "Talk | None":
-        config = configuration.on_task(replace(presets.preset(asked.preset), seed=asked.seed), task)
         return talk.talk(config, out, asked.seeds, asked.env_steps, watch)
 
     return _studied(study, out, asked.json, _print_answer)
@@ -109,11 +109,11 @@ def _print_answer(done: "Talk") -> None:
     from gacrl.report.screen import print_table, say
 
     screen = console()
-    earned = {**done.returns, **{f"talking, {how}": v for how, v in done.played.items() if how != talk.SENT}}
-    rows = [[name, *talk.cells(values)] for name, values in earned.items()]
-    print_table(
-        screen, ("", "return per agent", "every seed"), rows, f"random agents earn {done.answer.random:.2f}"
-    )
+    title = f"random agents earn {done.answer.random:.2f}"
+    for label, measured in done.measured.items():
+        rows = [[name, *talk.cells(values)] for name, values in measured.items()]
+        print_table(screen, ("", label, "every seed"), rows, title)
+        title = ""
     say(screen, done.sentence)
 
 

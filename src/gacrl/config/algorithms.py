@@ -123,6 +123,9 @@ class NetworkConfig:
     """After the messages, attend once more to the landmarks in sight, by what was heard (graph torso)."""
     look_sharpness: float = 4.0
     """Factor of the second look's attention scores."""
+    heard_slope: float = 0.0
+    """What the ReLUs of the layers that hear, and of the second look, let pass of negative numbers. At 0 they can fall
+    silent before words mean anything, and never hear again (discrete, soft, told)."""
     dial_noise: float = 2.0
     """Standard deviation of the noise on DIAL's units while learning."""
     radius: float = 1.5
@@ -140,6 +143,7 @@ class NetworkConfig:
         between("algorithm.network", self, 1, 65_536, "signature_size", "value_size")
         between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         between("algorithm.network", self, 1, 100, "depth", "rounds")
+        between("algorithm.network", self, 0.0, 1.0, "heard_slope")
         between("algorithm.network", self, 0.0, 100.0, "dial_noise", "symbol_noise", "look_sharpness")
         between("algorithm.network", self, 0.0, 1e6, "radius", "word_price")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")

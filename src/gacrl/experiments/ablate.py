@@ -63,7 +63,11 @@ PARTS: Mapping[str, Part] = MappingProxyType(
     {
         "no-graph": Part("layers over the observation vector in place of the entity graph", _network(torso="mlp")),
         "no-messages": Part("zero rounds of messages", _network(communication="none", gate=False, word_price=0.0)),
-        "soft-messages": Part("symbols softened, a continuous message", _network(communication="soft")),
+        "soft-messages": Part("symbols soft in play too, a continuous message", _network(communication="soft")),
+        "straight-through": Part(
+            "one-hot symbols with noise while learning", _network(symbols="straight_through", symbol_noise=1.0)
+        ),
+        "no-second-look": Part("nothing is looked at after the messages", _network(second_look=False)),
         "no-latent": Part("symbols made of the agent's vector, without a code", _network(latent="none")),
         "plain-code": Part("a deterministic code", _network(latent="deterministic")),
         "no-central-critic": Part("values summed, as VDN does", _algorithm(critic="sum")),
@@ -74,9 +78,6 @@ PARTS: Mapping[str, Part] = MappingProxyType(
             _algorithm(exploration="yoked"),
         ),
         "no-symmetry": Part("what is replayed is not turned", _algorithm(augment=False)),
-        "plain-play": Part(
-            "played in the world as it is, not by the mean over its turns", _algorithm(symmetric_play=False)
-        ),
         "one-step": Part("targets of one reward", _algorithm(n_step=1)),
         "no-average": Part("played with the parameters that learn", _algorithm(averaged=False)),
     }

@@ -19,7 +19,15 @@ from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
-from gacrl.evaluation.statistics import Difference, Estimate, difference, estimate, mean, with_interval
+from gacrl.evaluation.statistics import (
+    Difference,
+    Estimate,
+    difference,
+    estimate,
+    mean,
+    probability_of_improvement,
+    with_interval,
+)
 from gacrl.experiments import scoring
 from gacrl.experiments.study import (
     Planned,
@@ -83,6 +91,20 @@ class Talk:
     played: Mapping[str, NDArray[np.float64]]
     """Of the talking learner by what happens to its messages [S]."""
     answer: Answer
+    further: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+    """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
+
+    @property
+    def measured(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Every metric of the tables by its label: of the learners, then of the talking one with other messages [S]."""
+        caught = {f"{TALKING}, {how}": values for how, values in self.played.items() if how != SENT}
+        further = {label: dict(values) for label, values in self.further.items()}
+        return {"return per agent": {**self.returns, **caught}, **further}
+
+    @property
+    def improvement(self) -> Estimate:
+        """P(a talking seed earns more than a silent one)."""
+        return probability_of_improvement(self.returns[TALKING], self.returns[SILENT])
 
     @property
     def task(self) -> Task:
@@ -118,6 +140,11 @@ class Talk:
             "parameters": dict(self.parameters),
             "returns": {name: values.tolist() for name, values in self.returns.items()},
             "played": {name: values.tolist() for name, values in self.played.items()},
+            "further": {
+                label: {name: values.tolist() for name, values in measured.items()}
+                for label, measured in self.further.items()
+            },
+            "improvement": list(self.improvement),
             "worth": list(answer.worth[:3]),
             "used": list(answer.used),
             "random": answer.random,
@@ -211,19 +238,29 @@ def _read(out: Path, runs: Sequence[Planned]) -> Talk:
             raise UserError(f"there is no answer: the {run.name} learner {because}")
     config = runs[LEARNERS.index(TALKING)].config
     episodes = config.evaluation.final_episodes
-    returns = {run.name: _returns(str(run.folder), episodes) for run in runs}
-    talking = str(runs[LEARNERS.index(TALKING)].folder)
-    played = {name: _returns(talking, episodes, how) if how else returns[TALKING] for name, how in PLAYED.items()}
+    greedy = {run.name: _played(run.folder, episodes) for run in runs}
+    talking = runs[LEARNERS.index(TALKING)].folder
+    caught = {name: _played(talking, episodes, how) if how else greedy[TALKING] for name, how in PLAYED.items()}
+    every = {**greedy, **{f"{TALKING}, {name}": values for name, values in caught.items() if name != SENT}}
+    shown = tasks.find(config.task).shown(list(greedy[TALKING]))
+    further = {
+        label: {name: values[metric] for name, values in every.items()}
+        for metric, label in shown.items()
+        if metric != HEADLINE
+    }
+    returns = {name: values[HEADLINE] for name, values in greedy.items()}
+    played = {name: values[HEADLINE] for name, values in caught.items()}
     unscripted = scoring.play("random", episodes, lambda _: config.env, task=config.task)
     random = float(unscripted[HEADLINE].mean())
     parameters = {run.name: _num_parameters(run.config) for run in runs}
-    return Talk(out, out / "report.html", config, parameters, returns, played, answer(returns, played, random))
+    judged = answer(returns, played, random)
+    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further)
 
 
-def _returns(run: str, episodes: int, intervention: str = "") -> NDArray[np.float64]:
-    """The return of each seed [S], greedy."""
-    played = scoring.play(run, episodes, intervention=interventions.parse(intervention))
-    return np.asarray(played[HEADLINE].mean(1), float)
+def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArray[np.float64]]:
+    """Every metric of each seed [S], greedy."""
+    played = scoring.play(str(run), episodes, intervention=interventions.parse(intervention))
+    return {metric: np.asarray(values.mean(1), float) for metric, values in played.items()}
 
 
 def _report(done: Talk) -> Page:
@@ -246,14 +283,21 @@ def _report(done: Talk) -> Page:
         "The same talking agents, by what happens to their messages. Scrambled: every agent is heard with its words "
         "from another episode.",
     )
+    page.text(
+        f"A talking seed earns more than a silent one with probability {with_interval(done.improvement, '.2f')}."
+    )
+    for label, measured in done.further.items():
+        page.table(
+            ("", label, "every seed"),
+            [[name, *cells(values)] for name, values in measured.items()],
+            "The same episodes.",
+        )
+    label, earned = next(iter(done.measured.items()))
     page.figure(
         figures.dots(
-            {**done.returns, **{f"talking, {name}": v for name, v in done.played.items() if name != SENT}},
-            {
-                **{name: estimate(values, mean) for name, values in done.returns.items()},
-                **{f"talking, {n}": estimate(values, mean) for n, values in done.played.items() if n != SENT},
-            },
-            "return per agent",
+            earned,
+            {name: estimate(values, mean) for name, values in earned.items()},
+            label,
             {"random": done.answer.random},
         ),
         "Every seed is a dot, below them the mean and its 95 % interval.",

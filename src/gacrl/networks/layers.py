@@ -56,12 +56,27 @@ class Score(eqx.Module):
         return (x @ self.weight.T)[..., 0]
 
 
+def rectified(x: Float[Array, "*b"], slope: float = 0.0) -> Float[Array, "*b"]:
+    """x where it is positive, else slope · x: a ReLU, or a leaky one (Maas et al. 2013)."""
+    return jax.nn.leaky_relu(x, slope) if slope else jax.nn.relu(x)
+
+
 class Mlp(eqx.Module):
     """Affine layers with a ReLU after each of them."""
 
     layers: tuple[Linear, ...]
+    slope: float = eqx.field(static=True)
+    """What the ReLU lets pass of negative numbers."""
 
-    def __init__(self, in_size: int, hidden_sizes: tuple[int, ...], key: PRNGKey, gain: float | None = None):
+    def __init__(
+        self,
+        in_size: int,
+        hidden_sizes: tuple[int, ...],
+        key: PRNGKey,
+        gain: float | None = None,
+        slope: float = 0.0,
+    ):
+        self.slope = slope
         sizes = (in_size, *hidden_sizes)
         keys = jax.random.split(key, len(hidden_sizes))
         self.layers = tuple(Linear(i, o, k, gain) for i, o, k in zip(sizes, sizes[1:], keys, strict=False))
@@ -69,7 +84,7 @@ class Mlp(eqx.Module):
     def __call__(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """[*b in] -> [*b out]"""
         for layer in self.layers:
-            x = jax.nn.relu(layer(x))
+            x = rectified(layer(x), self.slope)
         return x
 
 

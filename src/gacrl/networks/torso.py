@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.graph import attend, with_length
-from gacrl.networks.layers import Linear, Mlp, Score
+from gacrl.networks.layers import Linear, Mlp, Score, rectified
 from gacrl.types import Entities, Observation, PRNGKey
 
 NEAR = 0.2
@@ -116,12 +116,13 @@ class SecondLook(eqx.Module):
     query: Linear
     merge: Linear
     sharpness: float = eqx.field(static=True)
+    slope: float = eqx.field(static=True)
 
     def __init__(self, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         query_key, merge_key = jax.random.split(key)
         self.query = Linear(config.width, config.width, query_key, gain)
         self.merge = Linear(2 * config.width, config.width, merge_key, gain)
-        self.sharpness = config.look_sharpness
+        self.sharpness, self.slope = config.look_sharpness, config.heard_slope
 
     def __call__(self, hidden: Float[Array, "N H"], looked: Looked) -> Float[Array, "N H"]:
         places, there = looked.places, looked.there
@@ -130,7 +131,7 @@ class SecondLook(eqx.Module):
             self.sharpness / math.sqrt(places.shape[-1])
         )
         chosen = attend(places, jnp.where(there, score, -jnp.inf))
-        return hidden + jax.nn.relu(self.merge(jnp.concatenate([hidden, chosen], axis=-1)))
+        return hidden + rectified(self.merge(jnp.concatenate([hidden, chosen], axis=-1)), self.slope)
 
 
 class _Group(NamedTuple):

@@ -341,7 +341,7 @@ def test_the_extended_runs_differ_by_the_algorithm_alone(tmp_path: Path):
             (0, 1, 2, 3, 4),
         )
         assert config.num_updates * config.steps_per_update == 150_000
-        assert (algorithm.network.torso, algorithm.augment, algorithm.symmetric_play) == ("graph", True, True)
+        assert (algorithm.network.torso, algorithm.augment, algorithm.symmetric_play) == ("graph", True, False)
         env = tasks.find(config.task).make(config.env)
         num_actions = choices(env).size
         sizes.append(acting_parameters(env, matched(env, algorithm.network, num_actions), num_actions))

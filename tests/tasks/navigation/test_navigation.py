@@ -161,6 +161,11 @@ def test_what_is_seen_thing_by_thing():
     assert len({tuple(row) for row in np.asarray(state.order)}) > 1, "everyone has an order of its own"
     others = state.positions[1:] - state.positions[0][None]
     np.testing.assert_allclose(things.agents[0], others, atol=1e-6)
+    names = things.agent_features
+    assert names is not None, "one's own number and the order of the row tell who the others are"
+    np.testing.assert_array_equal(np.asarray(names).argmax(-1), [[1, 2], [0, 2], [0, 1]])
+    nameless = environment("colours", identity=False)
+    assert nameless.entities(nameless.reset(jax.random.key(2))[1]).agent_features is None
 
 
 def test_rings_and_full_graphs():

@@ -13,7 +13,7 @@ from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
 from gacrl.networks.graph import attend, attend_to_speakers, sighted, sighted_size
-from gacrl.networks.layers import Linear, Mlp
+from gacrl.networks.layers import Linear, Mlp, rectified
 from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
 from gacrl.types import PRNGKey
 
@@ -38,6 +38,7 @@ class Symbols(Communication):
     """Whether to speak, a layer for each round; () where every agent always does."""
     word_price: float = eqx.field(static=True)
     noise: float = eqx.field(static=True)
+    slope: float = eqx.field(static=True)
     straight_through: bool = eqx.field(static=True)
     speaker_identity: bool = eqx.field(static=True)
 
@@ -50,12 +51,12 @@ class Symbols(Communication):
         self.noise, self.straight_through = config.symbol_noise, config.symbols == "straight_through"
         self.speaker_identity = config.speaker_identity
         known = symbols + sighted_size(env) + env.num_agents * config.speaker_identity
-        self.edge = tuple(Mlp(known, (narrow,), k, gain) for k in edge)
+        self.edge = tuple(Mlp(known, (narrow,), k, gain, config.heard_slope) for k in edge)
         self.query = tuple(Linear(width, narrow, k, gain) for k in query)
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
         gate = jax.random.split(jax.random.fold_in(key, 1), config.rounds) if config.gate else ()
         self.gate = tuple(Linear(i, 1, k, gain) for i, k in zip(sizes, gate, strict=False))
-        self.word_price = config.word_price
+        self.word_price, self.slope = config.word_price, config.heard_slope
 
     def speak(
         self,
@@ -85,7 +86,7 @@ class Symbols(Communication):
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
             heeded = edges_heard, jnp.where(near.adjacency, score, -jnp.inf)
             heard = attend_to_speakers(*heeded, words.sum(-1)) if self.gate else attend(*heeded)
-            hidden = hidden + jax.nn.relu(merge(jnp.concatenate([hidden, heard], axis=-1)))
+            hidden = hidden + rectified(merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
         messages = jnp.stack(said)
         price = self.word_price * messages.sum((0, 2)) if self.word_price else None
         return Spoken(hidden, messages, (), entropy, price)

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,7 +12,7 @@ from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
 from gacrl.networks.graph import attend, sighted, sighted_size
-from gacrl.networks.layers import Linear, Mlp
+from gacrl.networks.layers import Linear, Mlp, rectified
 from gacrl.types import PRNGKey
 
 
@@ -27,14 +28,16 @@ class Told(Communication):
     edge: Mlp
     query: Linear
     merge: Linear
+    slope: float = eqx.field(static=True)
 
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
         edge_key, query_key, merge_key = jax.random.split(key, 3)
         width = config.width
         known = env.observation_size + sighted_size(env) + env.num_agents
-        self.edge = Mlp(known, (width,) * config.depth, edge_key, gain)
+        self.edge = Mlp(known, (width,) * config.depth, edge_key, gain, config.heard_slope)
         self.query = Linear(width, width, query_key, gain)
         self.merge = Linear(2 * width, width, merge_key, gain)
+        self.slope = config.heard_slope
 
     def hear(
         self, hidden: Float[Array, "N H"], inbox: Any, near: Neighbourhood, key: PRNGKey | None
@@ -43,7 +46,7 @@ class Told(Communication):
         edges = self.edge(jnp.concatenate([told, sighted(near.sight), near.who()], axis=-1))
         score = jnp.einsum("nh,nkh->nk", self.query(hidden), edges) / math.sqrt(edges.shape[-1])
         heard = attend(edges, jnp.where(near.adjacency, score, -jnp.inf))
-        return hidden + jax.nn.relu(self.merge(jnp.concatenate([hidden, heard], axis=-1)))
+        return hidden + rectified(self.merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
 
     def speak(
         self,

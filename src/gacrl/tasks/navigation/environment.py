@@ -274,7 +274,12 @@ class Navigation(Environment):
             landmark_mask=jnp.broadcast_to(moves, landmarks.shape[:2]),
             agent_mask=jnp.ones(agents.shape[:2], bool),
             landmark_features=colours,
+            agent_features=self._names() if rules.bodies and self.identity else None,
         )
+
+    def _names(self) -> Float[Array, "N N-1 N"]:
+        """Which agent each other one is: told by its place in the row, as one's own identity says whose row it is."""
+        return _others(jnp.broadcast_to(jnp.eye(self.num_agents), (self.num_agents,) * 3))
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
         """Turn the vectors; colours, words and identities stay."""

@@ -128,7 +128,7 @@ class ColoursSettings:
     goal_bonus: float = 1.0
     """What a step on the own goal (within 0.1) adds to what is learned from; not in the metrics."""
     identity: bool = True
-    """Whether each agent sees which one it is."""
+    """Whether each agent sees which one it is, and which one each other agent is."""
 
     def __post_init__(self) -> None:
         _check(self)
