@@ -4,10 +4,12 @@
   entity graph for a torso, straight-through symbols, and receivers that know where the speaker stands.
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
   learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
-  actions stays each agent's own argmax, so that execution is decentralised.
+  actions stays each agent's own argmax, so that execution is decentralised. With `critic told` the agents of Q_tot are
+  for training only as well: they are told what the others see, and teach those who act and talk.
 - Exploration that adapts to progress, on `spread` coverage, (13) to (16): `exploration.adaptive`.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -51,13 +53,17 @@ def make(
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
     width = settings.width
+    told = replace(settings, communication="told", latent="none", gate=False, word_price=0.0)
 
     def networks(key: PRNGKey) -> Network:
         agent_key, layers_key, head_key = jax.random.split(key, 3)
         agent = AgentNetwork(env, settings, actions.size, agent_key)
         if config.critic == "sum":
             return Network(agent, ())
-        return Network(agent, (Mlp(width, (width,), layers_key), Linear(width, 1, head_key)))
+        value = (Mlp(width, (width,), layers_key), Linear(width, 1, head_key))
+        if config.critic == "central":
+            return Network(agent, value)
+        return Network(agent, value, AgentNetwork(env, told, actions.size, jax.random.fold_in(key, 1)))
 
     def auxiliary(output: AgentOutput, observation: Observation) -> Metrics:
         if settings.latent == "none":
@@ -67,7 +73,7 @@ def make(
 
     parts = Parts(
         networks=networks,
-        team_value=partial(central, actions) if config.critic == "central" else summed,
+        team_value=summed if config.critic == "sum" else partial(central, actions),
         auxiliary=auxiliary,
     )
     learner = q_learning.make(config, env, training, progress, parts)

@@ -6,7 +6,7 @@ remembered but made anew by the network that is learning; of memories, the one a
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -42,6 +42,13 @@ class Network(eqx.Module):
 
     agent: AgentNetwork
     team: Any
+    teacher: AgentNetwork | None = None
+    """Told what others see, and learns from rewards in the agents' place, who learn from it what each action loses."""
+
+    @property
+    def judge(self) -> AgentNetwork:
+        """The network that learns from rewards."""
+        return self.agent if self.teacher is None else self.teacher
 
 
 TeamValue = Callable[[Network, AgentOutput, Int[Array, " N"], Observation], Float[Array, " M"]]
@@ -173,7 +180,7 @@ def make(
             target_step=config.target_step,
             planned_steps=training.env_steps,
         ),
-        acting=lambda learner: learner._replace(optimizer=(), replay=(), rewards=()),
+        acting=acting,
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
         replay=lambda learner: learner.replay,
@@ -191,6 +198,12 @@ def agents_alone(config: QLearningConfig, env: Environment) -> Callable[[PRNGKey
         return Network(AgentNetwork(env, settings, num_choices, agent_key), ())
 
     return networks
+
+
+def acting(learner: LearnerState) -> LearnerState:
+    """What the agents act with, without what taught them."""
+    pupils = [replace(network, teacher=None) for network in (learner.network, learner.target)]
+    return learner._replace(network=pupils[0], target=pupils[1], optimizer=(), replay=(), rewards=())
 
 
 def init(q: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
@@ -260,9 +273,8 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
             output, after = play(q.env, symmetric, network.agent, observation, before, level.temperature)
             choice = greedy(output.head, q.actions.mask(observation.action_mask))
         best = greedy(output.head, q.actions.mask(observation.action_mask))
-        value = q.parts.team_value(network, output, best, observation).mean()
         extras = {
-            "value": jnp.broadcast_to(value, choice.shape),
+            "value": jnp.broadcast_to(value_now(q, network, output, best, observation), choice.shape),
             "choice": choice,
             "memory": before,
             "mode": mode,
@@ -271,6 +283,18 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
         return decision, ActMemory(after, mode) if isinstance(memory, ActMemory) else ()
 
     return act
+
+
+def value_now(
+    q: Setup, network: Network, output: AgentOutput, best: Int[Array, " N"], observation: Observation
+) -> Float[Array, ""] | float:
+    """The team's value of the best actions; by a teacher it is what it says without a memory, NaN once it has gone."""
+    if q.network.teacher is not None:
+        if network.teacher is None:
+            return jnp.nan
+        memory = network.teacher.initial_memory(q.env.num_agents)
+        output = network.teacher(observation, memory)[0]
+    return q.parts.team_value(network, output, best, observation).mean()
 
 
 class Pair(NamedTuple):
@@ -282,12 +306,12 @@ class Pair(NamedTuple):
 
 
 def along(
-    network: Network, steps: Transition, memory: Memory, key: PRNGKey | None, temperature: Array | float
+    network: AgentNetwork, steps: Transition, memory: Memory, key: PRNGKey | None, temperature: Array | float
 ) -> tuple[AgentOutput, Memory]:
     """Along a window: what is put out, and the memory after each step."""
     keys = None if key is None else jax.random.split(key, steps.first.shape[0])
     begins = beginnings(steps.first, steps.left)
-    return unroll(network.agent, steps.observation, begins, memory, keys, temperature)
+    return unroll(network, steps.observation, begins, memory, keys, temperature)
 
 
 def best_value(
@@ -302,10 +326,10 @@ def bootstrap(
     q: Setup, pair: Pair, observation: Observation, memory: Memory, target_memory: Memory
 ) -> Float[Array, " M"]:
     """The same of an observation that is yet to be looked at."""
-    theirs = pair.target.agent(observation, target_memory, temperature=pair.temperature)[0]
+    theirs = pair.target.judge(observation, target_memory, temperature=pair.temperature)[0]
     chooser = theirs
     if q.config.double_q:
-        chooser = pair.network.agent(observation, memory, temperature=pair.temperature)[0]
+        chooser = pair.network.judge(observation, memory, temperature=pair.temperature)[0]
     return best_value(q, pair.target, theirs, chooser, observation)
 
 
@@ -342,12 +366,15 @@ def window_loss(
     now = jax.tree.map(lambda leaf: leaf[:learned], seen)
     ends = window_ends(q, seen)
     if q.forgetful:
-        online, _ = along(network, now, (), key, pair.temperature)
+        online, _ = along(network.judge, now, (), key, pair.temperature)
         after = jax.tree.map(lambda leaf: leaf[ends.at], seen.next_observation)
         future = jax.vmap(lambda after: bootstrap(q, pair, after, (), ()))(after)
     else:
-        unrolled = along(network, seen, memory, key, pair.temperature)
-        theirs = along(pair.target, seen, memory, None, pair.temperature)
+        judged = (
+            memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
+        )  # nobody kept a teacher's
+        unrolled = along(network.judge, seen, judged, key, pair.temperature)
+        theirs = along(pair.target.judge, seen, judged, None, pair.temperature)
         future = following(q, pair, seen, unrolled, theirs)[ends.at]
         online = jax.tree.map(lambda leaf: leaf[:learned], unrolled[0])
     value = jax.vmap(lambda *now: q.parts.team_value(network, *now))(online, now.decision.action, now.observation)
@@ -357,9 +384,21 @@ def window_loss(
     error = value - jax.lax.stop_gradient(window_targets(q, seen, reward, future, ends, learner.hyper.gamma))
     real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
-    auxiliary = q.parts.auxiliary(online, now.observation)
+    auxiliary = {}
+    if network.teacher is not None:
+        teacher, (online, _) = online, along(network.agent, now, memory, key, pair.temperature)
+        auxiliary["loss_lesson"] = jax.vmap(partial(lesson, q))(online, teacher, now.observation).mean()
+    auxiliary |= q.parts.auxiliary(online, now.observation)
     metrics = {"loss_td": td, "value": value.mean(), **auxiliary}
     return td + sum(auxiliary.values(), jnp.zeros(())), metrics
+
+
+def lesson(q: Setup, pupil: AgentOutput, teacher: AgentOutput, observation: Observation) -> Float[Array, ""]:
+    """How far the agents' values are from what each action loses by their teacher, who knows more; summed over them."""
+    available = q.actions.mask(observation.action_mask)
+    best = jnp.where(available, teacher.head, -jnp.inf).max(-1, keepdims=True)
+    error = huber(pupil.head - jax.lax.stop_gradient(teacher.head - best), HUBER_DELTA)
+    return jnp.where(available & observation.agent_mask[:, None], error, 0.0).sum()
 
 
 class Ends(NamedTuple):

@@ -363,7 +363,7 @@ class Talk:
       gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
     """
 
-    preset: str = presets.DEFAULT_PRESET
+    preset: str = "gacrl-talk"
     """The preset that trains all three."""
     seeds: int = 3
     """Seeds of each."""

@@ -123,6 +123,8 @@ class NetworkConfig:
     """After the messages, attend once more to the landmarks in sight, by what was heard (graph torso)."""
     look_sharpness: float = 4.0
     """Factor of the second look's attention scores."""
+    logit_price: float = 0.0
+    """A loss on the mean square of the symbols' logits: who says one word whatever it sees can still change it."""
     heard_slope: float = 0.0
     """What the ReLUs of the layers that hear, and of the second look, let pass of negative numbers. At 0 they can fall
     silent before words mean anything, and never hear again (discrete, soft, told)."""
@@ -145,7 +147,7 @@ class NetworkConfig:
         between("algorithm.network", self, 1, 100, "depth", "rounds")
         between("algorithm.network", self, 0.0, 1.0, "heard_slope")
         between("algorithm.network", self, 0.0, 100.0, "dial_noise", "symbol_noise", "look_sharpness")
-        between("algorithm.network", self, 0.0, 1e6, "radius", "word_price")
+        between("algorithm.network", self, 0.0, 1e6, "radius", "word_price", "logit_price")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")
         require(
             self.torso == "graph" or not self.second_look,
@@ -363,8 +365,9 @@ class GacrlConfig(QLearningConfig):
     name: ClassVar[str] = "gacrl"
     learns_code: ClassVar[bool] = True
 
-    critic: Literal["central", "sum"] = "central"
-    """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN)."""
+    critic: Literal["told", "central", "sum"] = "central"
+    """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN); told: central, of
+    agents who are told what the others see, and from whom those who act learn what each action loses."""
     latent_weight: float = 1e-3
     """Weight of the code's loss: reconstruction and KL divergence."""
     exploration: str = "adaptive"

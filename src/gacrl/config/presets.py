@@ -119,15 +119,15 @@ _GACRL_NETWORK = NetworkConfig(
     symbol_noise=0.0,
     second_look=True,
     heard_slope=0.1,
+    logit_price=0.01,
 )
 
 
 def _gacrl(name: str, env: SpreadSettings, env_steps: int = 112_500, **changes: Any) -> RunConfig:
-    """GACRL as docs/log.md came to it: one set of values, whether something has to be said or not."""
+    """GACRL as docs/log.md came to it."""
     settings: dict[str, Any] = {
         "network": _GACRL_NETWORK,
         **_LEARNER,
-        "gamma": 0.8,
         "epsilon": 0.3,
         "temperature": 0.1,
         "temperature_end": 0.05,
@@ -146,6 +146,9 @@ _GACRL_TEAMS = _gacrl(
     env_steps=150_000,
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
+
+# The same values, and a critic that is told what has to be said: words are found in every seed, in 1.6 times the time.
+_GACRL_TALK = _gacrl("gacrl-talk", SpreadSettings(), env_steps=60_000, critic="told")
 
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, tuned in six trials
 # (docs/tuning). QMIX, which has VDN's settings, collapses in some seeds with them as with those of its best trial.
@@ -173,11 +176,15 @@ _GRAPH_IPPO = _graph_ppo(
 
 PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
     {
-        "gacrl": ("GACRL that solves the tasks, and talks where talk is needed", _GACRL),
+        "gacrl": ("GACRL that solves the task: episodes of 25 steps", _GACRL),
         "gacrl-112k": ("GACRL that solves the task, on the paper's budget of 112,500 steps", _GACRL_112K),
         "gacrl-teams": (
             "GACRL for teams of any size: trained with 5 agents, each sees what is near",
             _GACRL_TEAMS,
+        ),
+        "gacrl-talk": (
+            "the same with a critic that is told: for tasks in which something has to be said",
+            _GACRL_TALK,
         ),
         "graph-vdn": (
             "VDN with GACRL's switches: entity graph, symmetry, coverage bonus",

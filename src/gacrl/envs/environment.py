@@ -125,6 +125,10 @@ class Environment(ABC):
         known = [seen.agents] if seen.agent_features is None else [seen.agents, seen.agent_features]
         return with_self(jnp.where(seen.agent_mask[..., None], jnp.concatenate(known, axis=-1), 0.0))
 
+    def telling(self, observation: Observation) -> Float[Array, "N O"]:
+        """Return what each agent tells where all that it sees is told: by default its observation as it is."""
+        return observation.features
+
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
         """The observation of the turned world."""
         return observation

@@ -185,10 +185,13 @@ def plan(config: RunConfig, out: Path) -> list[Planned]:
     wanted = _num_parameters(config)
     runs: list[Planned] = []
     for name in LEARNERS:
-        changes: dict[str, Any] = {"communication": _KINDS[name]}
+        network: dict[str, Any] = {"communication": _KINDS[name]}
+        changes: dict[str, Any] = {"network": network}
         if name != TALKING:
-            changes |= {"parameters": wanted, "gate": False, "word_price": 0.0}  # what only symbols have
-        changed = configuration.from_dict({"algorithm": {"network": changes}}, config)
+            network |= {"parameters": wanted, "gate": False, "word_price": 0.0}  # what only symbols have
+            if getattr(config.algorithm, "critic", None) == "told":
+                changes["critic"] = "central"  # a teacher that is told teaches to talk, not to do without
+        changed = configuration.from_dict({"algorithm": changes}, config)
         runs.append(Planned(name, changed, out / name))
     return runs
 

@@ -67,6 +67,7 @@ class AgentNetwork(eqx.Module):
     radius: float = eqx.field(static=True)
     nearest: int | None = eqx.field(static=True)
     sight: Callable[[Observation], Float[Array, "N N S"]] = eqx.field(static=True)
+    telling: Callable[[Observation], Float[Array, "N O"]] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -87,7 +88,8 @@ class AgentNetwork(eqx.Module):
         if config.second_look:
             self.look = torsos.SecondLook(config, jax.random.fold_in(head_key, 1), gain)
         self.head = Linear(config.width, num_outputs, head_key, head_gain)
-        self.radius, self.nearest, self.sight = config.radius, config.nearest_agents, env.sight
+        self.radius, self.nearest = config.radius, config.nearest_agents
+        self.sight, self.telling = env.sight, env.telling
 
     def initial_memory(self, num_agents: int) -> Memory:
         """() for a network that remembers nothing."""
@@ -145,12 +147,13 @@ class AgentNetwork(eqx.Module):
     def _around(self, observation: Observation) -> tuple[Bool[Array, "N N"], Neighbourhood]:
         """Return the edges along which something arrives, and what each agent's network is given of them."""
         adjacency, sight = heard_adjacency(observation, self.radius), self.sight(observation)
+        telling = self.telling(observation)
         if self.nearest is None or self.nearest >= adjacency.shape[0]:
-            return adjacency, Neighbourhood(adjacency, sight, None, observation.arrives, observation.features)
+            return adjacency, Neighbourhood(adjacency, sight, None, observation.arrives, telling)
         speakers = nearest_speakers(observation.positions, adjacency, self.nearest)
         near = jnp.take_along_axis(adjacency, speakers, axis=1)
         seen = jnp.take_along_axis(sight, speakers[..., None], axis=1)
-        return adjacency, Neighbourhood(near, seen, speakers, observation.arrives, observation.features)
+        return adjacency, Neighbourhood(near, seen, speakers, observation.arrives, telling)
 
 
 def unroll(

@@ -27,7 +27,7 @@ class Symbols(Communication):
     and the edge's embedding).
 
     With a gate an agent may say nothing in a round. Its word is then zeros, and whoever says zeros is not heard, as if
-    the edge were cut. A price makes each word that is said a loss of its speaker.
+    the edge were cut. A price makes each word that is said a loss of its speaker, another one large logits.
     """
 
     encode: tuple[Linear, ...]
@@ -37,6 +37,7 @@ class Symbols(Communication):
     gate: tuple[Linear, ...]
     """Whether to speak, a layer for each round; () where every agent always does."""
     word_price: float = eqx.field(static=True)
+    logit_price: float = eqx.field(static=True)
     noise: float = eqx.field(static=True)
     slope: float = eqx.field(static=True)
     straight_through: bool = eqx.field(static=True)
@@ -56,7 +57,7 @@ class Symbols(Communication):
         self.merge = tuple(Linear(width + narrow, width, k, gain) for k in merge)
         gate = jax.random.split(jax.random.fold_in(key, 1), config.rounds) if config.gate else ()
         self.gate = tuple(Linear(i, 1, k, gain) for i, k in zip(sizes, gate, strict=False))
-        self.word_price, self.slope = config.word_price, config.heard_slope
+        self.word_price, self.logit_price, self.slope = config.word_price, config.logit_price, config.heard_slope
 
     def speak(
         self,
@@ -67,6 +68,7 @@ class Symbols(Communication):
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
         known, said, entropy = [sighted(near.sight)], [], jnp.zeros(hidden.shape[0])
+        squares = jnp.zeros(hidden.shape[0])
         rounds = len(self.encode)
         if self.speaker_identity:
             known.append(near.who())
@@ -75,6 +77,7 @@ class Symbols(Communication):
         ):
             meant = hidden if code is None or number else code
             logits = encode(meant)
+            squares += jnp.square(logits).mean(-1)
             log_symbol = jax.nn.log_softmax(logits)
             entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / rounds
             draw = None if key is None else jax.random.fold_in(key, number)
@@ -88,8 +91,9 @@ class Symbols(Communication):
             heard = attend_to_speakers(*heeded, words.sum(-1)) if self.gate else attend(*heeded)
             hidden = hidden + rectified(merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
         messages = jnp.stack(said)
-        price = self.word_price * messages.sum((0, 2)) if self.word_price else None
-        return Spoken(hidden, messages, (), entropy, price)
+        prices = [self.word_price * messages.sum((0, 2))] if self.word_price else []
+        prices += [self.logit_price * squares] if self.logit_price else []
+        return Spoken(hidden, messages, (), entropy, sum(prices[1:], prices[0]) if prices else None)
 
     def spoke(
         self, meant: Float[Array, "N M"], number: int, key: PRNGKey | None, temperature: Float[Array, ""] | float

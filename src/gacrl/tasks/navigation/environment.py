@@ -253,11 +253,10 @@ class Navigation(Environment):
 
     def entities(self, observation: Observation) -> Entities:
         """Take what is seen apart: landmarks with their colours, or with the mark of the goal that is known."""
-        rules, features, (low, high) = self.rules, observation.features, self.rules.colours
+        rules, features = self.rules, self.telling(observation)
         num_agents, seen = self.num_agents, 2 + 2 * rules.landmarks
         heard = self.vectors + rules.landmarks
         goal = features[:, self.vectors : heard]
-        goal = jnp.where(goal > 0, (goal - low) / (high - low), 0.0)  # MPE2's colours are pale
         rest = features[:, heard if self.utters else heard + rules.words * (num_agents - 1) :]
         landmarks = features[:, 2:seen].reshape(num_agents, rules.landmarks, 2)
         agents = features[:, seen : self.vectors].reshape(num_agents, -1, 2)
@@ -280,6 +279,13 @@ class Navigation(Environment):
     def _names(self) -> Float[Array, "N N-1 N"]:
         """Which agent each other one is: told by its place in the row, as one's own identity says whose row it is."""
         return _others(jnp.broadcast_to(jnp.eye(self.num_agents), (self.num_agents,) * 3))
+
+    def telling(self, observation: Observation) -> Float[Array, "N O"]:
+        """Return what is seen, the goal that is known as one-hot: MPE2's colours are pale."""
+        features, (low, high) = observation.features, self.rules.colours
+        begin, end = self.vectors, self.vectors + self.rules.landmarks
+        goal = features[:, begin:end]
+        return features.at[:, begin:end].set(jnp.where(goal > 0, (goal - low) / (high - low), 0.0))
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
         """Turn the vectors; colours, words and identities stay."""
