@@ -1,6 +1,8 @@
 """GACRL: the team's value, execution without a centre, pushes for actions."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +11,14 @@ import pytest
 from conftest import drawn
 
 from gacrl.algorithms import build as algorithms
-from gacrl.algorithms import gacrl
+from gacrl.algorithms import gacrl, q_learning
+from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import STRENGTHS, choices
 from gacrl.algorithms.q_learning import Network
 from gacrl.config import presets
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.config.run import TrainingConfig
-from gacrl.networks.agent import AgentNetwork
+from gacrl.networks.agent import AgentNetwork, AgentOutput
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import most_likely_symbol
 from gacrl.tasks.spread.environment import Spread
@@ -56,6 +59,67 @@ def test_the_teams_value_is_the_critics_less_what_each_agent_falls_short():
     value = head(layers(output.hidden[jnp.array([0, 2, 3])].mean(0)))
     found = gacrl.central(choices(ENV), network, output, worse, padded)
     np.testing.assert_allclose(found, value, rtol=1e-5, err_msg="who is not there counts nothing")
+
+
+TAUGHT = replace(SMALL, critic="told", averaged=False, network=replace(TALKING, latent="none"))
+
+
+def test_rewards_teach_the_teacher_and_the_teacher_the_agents():
+    """Each term of the loss has gradients in one of the two networks alone; who acts needs the agents alone."""
+    trainer = Trainer(
+        algorithms.make(TAUGHT, ENV, TRAINING), ENV, constant(), TRAINING.num_envs, TRAINING.num_steps
+    )
+    state, _ = trainer.chunk(trainer.init((0,)), 4)
+    learner = jax.tree.map(lambda leaf: leaf[0], state.learner)
+    q = trainer.algorithm.init.args[0]  # pyright: ignore[reportFunctionMemberAccess] a partial
+    unpack = ring.packing(partial(q_learning.example, q))[1]
+    window = jax.vmap(unpack)(learner.replay.items[: q.window, 0])
+
+    @jax.jit
+    def slopes(network: Network) -> Any:
+        def term(name: str) -> Any:
+            def of(network: Network) -> jax.Array:
+                return q_learning.window_loss(q, network, learner, learner.rewards, window, jax.random.key(1))[1][
+                    name
+                ]
+
+            return jax.grad(of)(network)
+
+        return term("loss_td"), term("loss_lesson")
+
+    def size(network: Any) -> float:
+        return float(sum(jnp.abs(leaf).sum() for leaf in jax.tree.leaves(network)))
+
+    rewarded, taught = slopes(learner.network)
+    assert size(rewarded.agent) == 0.0 and size(rewarded.teacher) > 1e-3
+    assert size(taught.agent) > 1e-3 and size(taught.teacher) == 0.0
+
+    alone = trainer.algorithm.acting(learner)
+    assert alone.network.teacher is None and alone.target.teacher is None
+    _, seen = ENV.reset(jax.random.key(0))
+    acts = [trainer.algorithm.policy(it, False)((), seen, jax.random.key(1))[0] for it in (learner, alone)]
+    np.testing.assert_array_equal(acts[0].action, acts[1].action)
+    assert np.isfinite(acts[0].extras["value"]).all() and np.isnan(acts[1].extras["value"]).all()
+
+
+def test_a_lesson_is_what_each_action_loses_by_the_teacher():
+    """Of four agents one may not do the last action, and two are not there."""
+    q = algorithms.make(TAUGHT, ENV, TRAINING).init.args[0]  # pyright: ignore[reportFunctionMemberAccess] a partial
+    _, seen = ENV.reset(jax.random.key(0))
+    seen = seen._replace(
+        agent_mask=jnp.array([True, True, False, False]),
+        action_mask=jnp.ones((4, 5), bool).at[1, 4].set(False),
+    )
+
+    def says(*heads: list[float]) -> AgentOutput:
+        rows = jnp.asarray([*heads, [5.0] * 5, [7.0] * 5])
+        return AgentOutput(rows, jnp.zeros((4, 8)), None, jnp.zeros((4, 4), bool), 0.0, 0.0)
+
+    teacher = says(
+        [3.0, 2.0, 2.0, 3.0, 3.0], [0.0, 4.0, 4.0, 4.0, 9.0]
+    )  # loses (0, −1, −1, 0, 0), (−4, 0, 0, 0, ·)
+    pupils = says([0.0, -1.0, -2.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 9.0])  # errs by −1 in one, by 5 in another
+    np.testing.assert_allclose(q_learning.lesson(q, pupils, teacher, seen), 0.5 * (1 + 25))
 
 
 def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():

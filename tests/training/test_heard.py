@@ -187,7 +187,7 @@ def test_the_replay_of_q_learning_holds_what_arrived_and_windows_hear_it(name: s
         def of_one(transition: Any, memory: Any) -> Any:
             first = jax.tree.map(lambda leaf: leaf[0], memory)
             temperature = q.explorer.level(learner.exploration, learner.env_steps).temperature
-            output, _ = q_learning.along(learner.network, transition, first, None, temperature)
+            output, _ = q_learning.along(learner.network.agent, transition, first, None, temperature)
 
             def value(output: Any, seen: Any) -> Any:
                 best = q_learning.greedy(output.head, q.actions.mask(seen.action_mask))

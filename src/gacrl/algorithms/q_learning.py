@@ -292,8 +292,7 @@ def value_now(
     if q.network.teacher is not None:
         if network.teacher is None:
             return jnp.nan
-        memory = network.teacher.initial_memory(q.env.num_agents)
-        output = network.teacher(observation, memory)[0]
+        output = network.teacher(told(observation), network.teacher.initial_memory(q.env.num_agents))[0]
     return q.parts.team_value(network, output, best, observation).mean()
 
 
@@ -357,7 +356,7 @@ def window_loss(
     q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
 ) -> tuple[Float[Array, ""], Metrics]:
     """The loss on one window [W, …] of one environment."""
-    seen, learned = steps.transition, q.config.sequence_length
+    seen, learned = as_judged(network, steps.transition), q.config.sequence_length
     memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
     if q.config.augment:  # what is remembered is not turned
         memory = jax.tree.map(jnp.zeros_like, memory)
@@ -370,11 +369,11 @@ def window_loss(
         after = jax.tree.map(lambda leaf: leaf[ends.at], seen.next_observation)
         future = jax.vmap(lambda after: bootstrap(q, pair, after, (), ()))(after)
     else:
-        judged = (
+        before = (
             memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
-        )  # nobody kept a teacher's
-        unrolled = along(network.judge, seen, judged, key, pair.temperature)
-        theirs = along(pair.target.judge, seen, judged, None, pair.temperature)
+        )  # a teacher's is not kept
+        unrolled = along(network.judge, seen, before, key, pair.temperature)
+        theirs = along(pair.target.judge, seen, before, None, pair.temperature)
         future = following(q, pair, seen, unrolled, theirs)[ends.at]
         online = jax.tree.map(lambda leaf: leaf[:learned], unrolled[0])
     value = jax.vmap(lambda *now: q.parts.team_value(network, *now))(online, now.decision.action, now.observation)
@@ -386,11 +385,24 @@ def window_loss(
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
     auxiliary = {}
     if network.teacher is not None:
-        teacher, (online, _) = online, along(network.agent, now, memory, key, pair.temperature)
+        heard = jax.tree.map(lambda leaf: leaf[:learned], steps.transition)
+        teacher, (online, _) = online, along(network.agent, heard, memory, key, pair.temperature)
         auxiliary["loss_lesson"] = jax.vmap(partial(lesson, q))(online, teacher, now.observation).mean()
     auxiliary |= q.parts.auxiliary(online, now.observation)
     metrics = {"loss_td": td, "value": value.mean(), **auxiliary}
     return td + sum(auxiliary.values(), jnp.zeros(())), metrics
+
+
+def told(observation: Observation) -> Observation:
+    """What a teacher is shown: it is told all, whatever happens to words; cut edges stay cut."""
+    return observation._replace(arrives=Arrives(kept=observation.arrives.kept))
+
+
+def as_judged(network: Network, steps: Transition) -> Transition:
+    """What the network that learns from rewards is shown."""
+    if network.teacher is None:
+        return steps
+    return steps._replace(observation=told(steps.observation), next_observation=told(steps.next_observation))
 
 
 def lesson(q: Setup, pupil: AgentOutput, teacher: AgentOutput, observation: Observation) -> Float[Array, ""]:
