@@ -59,6 +59,7 @@ def test_score_talk_is_0_in_silence_and_1_where_all_is_told():
         ("reference", {"max_cycles": 50}, False),
         ("scouts", {"num_agents": 5}, False),
         ("scouts", {"reward": "mpe2"}, True),
+        ("spread", {}, False),  # its anchors are there, and being told is worth next to nothing
         ("traffic_junction", {"arrival_start": 0.1}, True),
         ("traffic_junction", {"vision": 1}, False),
     ],

@@ -6,7 +6,7 @@ then played with its messages silenced, scrambled and delayed: only that shows w
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -41,7 +41,7 @@ from gacrl.messages import interventions
 from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
-from gacrl.tasks.task import HEADLINE, Task
+from gacrl.tasks.task import HEADLINE, MATTERS, Task
 
 SILENT, TALKING, TOLD = LEARNERS = ("silent", "talking", "told")
 _HEARD: Mapping[str, str] = MappingProxyType(
@@ -59,8 +59,6 @@ PLAYED: Mapping[str, str] = MappingProxyType(
 """What happens to the talking learner's messages, and the intervention that does it."""
 ENV_STEPS = 40_000
 EVALUATIONS = 8
-MATTERS = 0.05
-"""The share of a gain that counts: of what told agents gain, and of what learning gains at all."""
 
 
 class Answer(NamedTuple):
@@ -91,7 +89,7 @@ class Talk:
     played: Mapping[str, NDArray[np.float64]]
     """Of the talking learner by what happens to its messages [S]."""
     answer: Answer
-    further: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+    further: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
     """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
 
     @property

@@ -65,6 +65,8 @@ def complete(settings: Settings) -> bool:
 
 SILENT, TOLD = "silent", "told"
 """Among a task's references and anchors: the best policy that says nothing, and one to which everything is told."""
+MATTERS = 0.05
+"""The share of a gain that counts: of what told agents gain, and of what learning gains at all."""
 HEADLINE = "return_agent_mean"
 RETURN: Mapping[str, Metric] = MappingProxyType(
     {
@@ -174,9 +176,15 @@ class Task(NamedTuple):
             ) from error
 
     def _talk(self, settings: Settings) -> dict[str, float] | None:
-        """Return the headline of the best silent and of a told policy; None where the anchors are of other settings."""
+        """Return the headline of the best silent and of a told policy.
+
+        None where the anchors are of other settings, or being told is worth too little for a scale.
+        """
         known = self.known()
         scale = {who: known.get("scores", {}).get(who) for who in (SILENT, TOLD)}
         anchored = known.get("settings", {})
         same = all(getattr(settings, name, None) == value for name, value in anchored.items())
-        return scale if anchored and same and None not in scale.values() else None  # pyright: ignore[reportReturnType]
+        if not anchored or not same or None in scale.values():
+            return None
+        random, silent, told = (known["scores"][who] for who in ("random", SILENT, TOLD))
+        return scale if abs(told - silent) > MATTERS * abs(silent - random) else None
