@@ -39,7 +39,7 @@ class Table(AgentNetwork):
 
     def __init__(self, remembers: bool):
         self.torso = self.code = self.memory = self.communication = self.look = self.head = None  # type: ignore
-        self.radius, self.nearest, self.sight = 0.0, None, ENV.sight
+        self.radius, self.nearest, self.sight, self.telling = 0.0, None, ENV.sight, ENV.telling
         self.scale, self.remembers = jnp.ones(1), remembers
 
     def initial_memory(self, num_agents: int) -> Any:

@@ -41,7 +41,14 @@ KINDS: dict[str, dict[str, Any]] = {
     "told": {"communication": "told"},
     "tarmac": {"communication": "tarmac", "rounds": 2, "signature_size": 2, "value_size": 3},
     "ic3net": {"communication": "ic3net", "rounds": 2},
-    "gated": {"communication": "discrete", "rounds": 2, "vocabulary": 4, "gate": True, "word_price": 0.01},
+    "gated": {
+        "communication": "discrete",
+        "rounds": 2,
+        "vocabulary": 4,
+        "gate": True,
+        "word_price": 0.01,
+        "symbol_noise": 1.0,
+    },
 }
 
 

@@ -360,6 +360,7 @@ class Talk:
     examples:
       gacrl talk --env reference
       gacrl talk --env examples/own_task.py:Beacon --env-steps 10000
+      gacrl talk --env colours --env.graph full --env-steps 120000 --out runs/full
       gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
     """
 

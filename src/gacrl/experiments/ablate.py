@@ -61,7 +61,10 @@ def _algorithm(**changes: Any) -> Mapping[str, Any]:
 
 PARTS: Mapping[str, Part] = MappingProxyType(
     {
-        "no-graph": Part("layers over the observation vector in place of the entity graph", _network(torso="mlp")),
+        "no-graph": Part(
+            "layers over the observation vector in place of the entity graph",
+            _network(torso="mlp", second_look=False),
+        ),
         "no-messages": Part("zero rounds of messages", _network(communication="none", gate=False, word_price=0.0)),
         "soft-messages": Part("symbols soft in play too, a continuous message", _network(communication="soft")),
         "straight-through": Part(
