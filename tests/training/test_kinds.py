@@ -47,6 +47,7 @@ KINDS: dict[str, dict[str, Any]] = {
         "vocabulary": 4,
         "gate": True,
         "word_price": 0.01,
+        "logit_price": 0.0,
         "symbol_noise": 1.0,
     },
 }
