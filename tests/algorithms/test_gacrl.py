@@ -11,14 +11,14 @@ import pytest
 from conftest import drawn
 
 from gacrl.algorithms import build as algorithms
-from gacrl.algorithms import gacrl, q_learning
+from gacrl.algorithms import gacrl, q_learning, teaching
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import STRENGTHS, choices
 from gacrl.algorithms.q_learning import Network
 from gacrl.config import presets
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.config.run import TrainingConfig
-from gacrl.networks.agent import AgentNetwork, AgentOutput
+from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import most_likely_symbol
 from gacrl.tasks.spread.environment import Spread
@@ -111,15 +111,15 @@ def test_a_lesson_is_what_each_action_loses_by_the_teacher():
         action_mask=jnp.ones((4, 5), bool).at[1, 4].set(False),
     )
 
-    def says(*heads: list[float]) -> AgentOutput:
-        rows = jnp.asarray([*heads, [5.0] * 5, [7.0] * 5])
-        return AgentOutput(rows, jnp.zeros((4, 8)), None, jnp.zeros((4, 4), bool), 0.0, 0.0)
+    def says(*heads: list[float]) -> jax.Array:
+        return jnp.asarray([*heads, [5.0] * 5, [7.0] * 5])
 
-    teacher = says(
-        [3.0, 2.0, 2.0, 3.0, 3.0], [0.0, 4.0, 4.0, 4.0, 9.0]
-    )  # loses (0, −1, −1, 0, 0), (−4, 0, 0, 0, ·)
-    pupils = says([0.0, -1.0, -2.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 9.0])  # errs by −1 in one, by 5 in another
-    np.testing.assert_allclose(q_learning.lesson(q, pupils, teacher, seen), 0.5 * (1 + 25))
+    # The teacher's actions lose (0, −1, −1, 0, 0) and (−4, 0, 0, 0, ·); the pupils err by −1 in one and by 5 in another.
+    teacher = says([3.0, 2.0, 2.0, 3.0, 3.0], [0.0, 4.0, 4.0, 4.0, 9.0])
+    pupils = says([0.0, -1.0, -2.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 9.0])
+    available = q.actions.mask(seen.action_mask)
+    found = teaching.lesson(pupils, teacher, available, seen.agent_mask)
+    np.testing.assert_allclose(found, 0.5 * (1 + 25))
 
 
 def test_each_agent_acts_on_what_it_sees_and_what_it_is_told():

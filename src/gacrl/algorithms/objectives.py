@@ -20,6 +20,10 @@ def clipped_surrogate(
     return -jnp.minimum(ratio * advantage, clipped * advantage)
 
 
+HUBER_DELTA = 10.0
+"""Errors of values beyond this count linearly."""
+
+
 def huber(error: Float[Array, "*b"], delta: float) -> Float[Array, "*b"]:
     """½ e² up to |e| = delta, linear beyond (Huber 1964); elementwise."""
     small = jnp.minimum(jnp.abs(error), delta)

@@ -21,9 +21,10 @@ from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.exploration import Exploration, progress_between
-from gacrl.algorithms.objectives import ValueNorm, follow_returns, huber, no_returns
+from gacrl.algorithms.objectives import HUBER_DELTA, ValueNorm, follow_returns, huber, no_returns
 from gacrl.algorithms.returns import n_step_returns, n_step_window, next_values
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward
+from gacrl.algorithms.teaching import as_told, lesson, told
 from gacrl.config.algorithms import QLearningConfig
 from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
@@ -32,9 +33,6 @@ from gacrl.messages import interventions
 from gacrl.networks.agent import AgentNetwork, AgentOutput, matched, unroll, words_said
 from gacrl.networks.memory import beginnings, restarted
 from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
-
-HUBER_DELTA = 10.0
-"""Errors beyond this count linearly."""
 
 
 class Network(eqx.Module):
@@ -356,7 +354,8 @@ def window_loss(
     q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
 ) -> tuple[Float[Array, ""], Metrics]:
     """The loss on one window [W, …] of one environment."""
-    seen, learned = as_judged(network, steps.transition), q.config.sequence_length
+    heard, learned = steps.transition, q.config.sequence_length
+    seen = heard if network.teacher is None else as_told(heard)
     memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
     if q.config.augment:  # what is remembered is not turned
         memory = jax.tree.map(jnp.zeros_like, memory)
@@ -369,9 +368,8 @@ def window_loss(
         after = jax.tree.map(lambda leaf: leaf[ends.at], seen.next_observation)
         future = jax.vmap(lambda after: bootstrap(q, pair, after, (), ()))(after)
     else:
-        before = (
-            memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
-        )  # a teacher's is not kept
+        # What a teacher remembers is not kept.
+        before = memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
         unrolled = along(network.judge, seen, before, key, pair.temperature)
         theirs = along(pair.target.judge, seen, before, None, pair.temperature)
         future = following(q, pair, seen, unrolled, theirs)[ends.at]
@@ -385,32 +383,14 @@ def window_loss(
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
     auxiliary = {}
     if network.teacher is not None:
-        heard = jax.tree.map(lambda leaf: leaf[:learned], steps.transition)
+        heard = jax.tree.map(lambda leaf: leaf[:learned], heard)
         teacher, (online, _) = online, along(network.agent, heard, memory, key, pair.temperature)
-        auxiliary["loss_lesson"] = jax.vmap(partial(lesson, q))(online, teacher, now.observation).mean()
+        available = q.actions.mask(now.observation.action_mask)
+        taught = jax.vmap(lesson)(online.head, teacher.head, available, now.observation.agent_mask)
+        auxiliary["loss_lesson"] = taught.mean()
     auxiliary |= q.parts.auxiliary(online, now.observation)
     metrics = {"loss_td": td, "value": value.mean(), **auxiliary}
     return td + sum(auxiliary.values(), jnp.zeros(())), metrics
-
-
-def told(observation: Observation) -> Observation:
-    """What a teacher is shown: it is told all, whatever happens to words; cut edges stay cut."""
-    return observation._replace(arrives=Arrives(kept=observation.arrives.kept))
-
-
-def as_judged(network: Network, steps: Transition) -> Transition:
-    """What the network that learns from rewards is shown."""
-    if network.teacher is None:
-        return steps
-    return steps._replace(observation=told(steps.observation), next_observation=told(steps.next_observation))
-
-
-def lesson(q: Setup, pupil: AgentOutput, teacher: AgentOutput, observation: Observation) -> Float[Array, ""]:
-    """How far the agents' values are from what each action loses by their teacher, who knows more; summed over them."""
-    available = q.actions.mask(observation.action_mask)
-    best = jnp.where(available, teacher.head, -jnp.inf).max(-1, keepdims=True)
-    error = huber(pupil.head - jax.lax.stop_gradient(teacher.head - best), HUBER_DELTA)
-    return jnp.where(available & observation.agent_mask[:, None], error, 0.0).sum()
 
 
 class Ends(NamedTuple):
