@@ -1,7 +1,9 @@
 """Make a policy that comes along out of one seed of a run: its last checkpoint, without what only learning needs.
 
-python benchmarks/ship.py runs/gacrl gacrl --seed 0
-gacrl evaluate pretrained:gacrl
+    python benchmarks/ship.py runs/gacrl gacrl --seed 0
+    gacrl evaluate pretrained:gacrl
+
+Writes src/gacrl/pretrained/NAME anew.
 """
 
 import argparse

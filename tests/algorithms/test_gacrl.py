@@ -18,12 +18,15 @@ from gacrl.algorithms.q_learning import Network
 from gacrl.config import presets
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.config.run import TrainingConfig
+from gacrl.errors import ConfigError
+from gacrl.messages import interventions
 from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.networks.messages import most_likely_symbol
 from gacrl.tasks.spread.environment import Spread
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
+from gacrl.types import Arrives
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
@@ -100,6 +103,28 @@ def test_rewards_teach_the_teacher_and_the_teacher_the_agents():
     acts = [trainer.algorithm.policy(it, False)((), seen, jax.random.key(1))[0] for it in (learner, alone)]
     np.testing.assert_array_equal(acts[0].action, acts[1].action)
     assert np.isfinite(acts[0].extras["value"]).all() and np.isnan(acts[1].extras["value"]).all()
+
+
+def test_a_teacher_is_told_all_whatever_happens_to_words():
+    """Words on their way are the agents' alone; a cut edge is cut for both. A step late, nobody could be taught."""
+    _, seen = ENV.reset(jax.random.key(0))
+    arrives = Arrives(jnp.ones((1, 4, 4)), jnp.ones((1, 4), bool), ~jnp.eye(4, dtype=bool))
+    shown = teaching.told(seen._replace(arrives=arrives)).arrives
+    assert shown.values is None and shown.replaced is None and shown.kept is arrives.kept
+    training = replace(TRAINING, intervention="swap 0 1")
+    trainer = Trainer(
+        algorithms.make(TAUGHT, ENV, training),
+        ENV,
+        constant(),
+        TRAINING.num_envs,
+        TRAINING.num_steps,
+        intervention=interventions.parse("swap 0 1"),
+    )
+    _, report = trainer.chunk(trainer.init((0,)), 4)
+    assert float(report.metrics["loss_lesson"][0]) > 0 and np.isfinite(report.metrics["loss_td"]).all()
+    late = replace(TAUGHT, network=replace(TAUGHT.network, communication="dial"))
+    with pytest.raises(ConfigError, match="algorithm.critic told needs messages that are heard in the step"):
+        algorithms.make(late, ENV, TRAINING)
 
 
 def test_a_lesson_is_what_each_action_loses_by_the_teacher():

@@ -70,6 +70,12 @@ def test_the_three_learners_are_about_as_large(tmp_path: Path):
     assert len({run.config.algorithm.network.communication for run in runs}) == 3  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_only_those_who_talk_are_taught_to(tmp_path: Path):
+    runs = talk.plan(configuration.on_task(configuration.preset("gacrl-talk"), "reference"), tmp_path)
+    critics = [run.config.algorithm.critic for run in runs]  # pyright: ignore[reportAttributeAccessIssue]
+    assert critics == ["central", "told", "central"]
+
+
 def test_what_cannot_talk_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="--seeds must be at least 2, not 1"):
         talk.talk(ON_REFERENCE, tmp_path / "one", seeds=1)

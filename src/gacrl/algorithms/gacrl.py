@@ -1,7 +1,7 @@
 """GACRL that solves the task: the paper's ideas, each in a place where it can work.
 
 - Latent code and discrete messages over the proximity graph, as the paper's (2) to (9): `networks.agent`, with an
-  entity graph for a torso, straight-through symbols, and receivers that know where the speaker stands.
+  entity graph for a torso, and receivers that know where the speaker stands and look again after they have heard.
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
   learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
   actions stays each agent's own argmax, so that execution is decentralised. With `critic told` the agents of Q_tot are
@@ -23,6 +23,7 @@ from gacrl.algorithms.q_learning import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
 from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import GacrlConfig
+from gacrl.config.checks import require
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput, matched
@@ -58,6 +59,11 @@ def make(
     def networks(key: PRNGKey) -> Network:
         agent_key, layers_key, head_key = jax.random.split(key, 3)
         agent = AgentNetwork(env, settings, actions.size, agent_key)
+        require(
+            config.critic != "told" or not agent.communication.heard_late,
+            f"algorithm.critic told needs messages that are heard in the step in which they are said, which "
+            f"{settings.communication} has not: take central",
+        )
         if config.critic == "sum":
             return Network(agent, ())
         value = (Mlp(width, (width,), layers_key), Linear(width, 1, head_key))

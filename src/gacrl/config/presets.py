@@ -102,7 +102,7 @@ _LEARNER: dict[str, Any] = {
 
 
 def _dear(name: str, algorithm: AlgorithmConfig, env: SpreadSettings, training: TrainingConfig) -> RunConfig:
-    """Few environment steps, on `spread` rewarded with the coverage bonus."""
+    """Few environment steps, rewarded with the coverage bonus."""
     env, evaluation = replace(env, reward="coverage"), EvaluationConfig(interval=7_500)
     return RunConfig(algorithm=algorithm, env=env, training=training, evaluation=evaluation, preset=name)
 
@@ -147,7 +147,7 @@ _GACRL_TEAMS = _gacrl(
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
 
-# The same values, and a critic that is told what has to be said: words are found in every seed, in 1.6 times the time.
+# The same values, and a critic that is told what others see: words are found in more seeds (docs/log.md).
 _GACRL_TALK = _gacrl("gacrl-talk", SpreadSettings(), env_steps=60_000, critic="told")
 
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, tuned in six trials
@@ -183,7 +183,7 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
             _GACRL_TEAMS,
         ),
         "gacrl-talk": (
-            "the same with a critic that is told: for tasks in which something has to be said",
+            "GACRL whose critic is told what others see, for tasks in which something has to be said",
             _GACRL_TALK,
         ),
         "graph-vdn": (

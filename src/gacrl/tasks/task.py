@@ -181,10 +181,10 @@ class Task(NamedTuple):
         None where the anchors are of other settings, or being told is worth too little for a scale.
         """
         known = self.known()
-        scale = {who: known.get("scores", {}).get(who) for who in (SILENT, TOLD)}
+        random, silent, told = (known.get("scores", {}).get(who) for who in ("random", SILENT, TOLD))
         anchored = known.get("settings", {})
         same = all(getattr(settings, name, None) == value for name, value in anchored.items())
-        if not anchored or not same or None in scale.values():
+        if not anchored or not same or silent is None or told is None:
             return None
-        random, silent, told = (known["scores"][who] for who in ("random", SILENT, TOLD))
-        return scale if abs(told - silent) > MATTERS * abs(silent - random) else None
+        slight = random is not None and abs(told - silent) <= MATTERS * abs(silent - random)
+        return None if slight else {SILENT: silent, TOLD: told}
