@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gacrl.cli import arguments, parsing
 from gacrl.config import files as configuration
 from gacrl.errors import UserError
 from gacrl.experiments import talk
@@ -74,6 +75,17 @@ def test_only_those_who_talk_are_taught_to(tmp_path: Path):
     runs = talk.plan(configuration.on_task(configuration.preset("gacrl-talk"), "reference"), tmp_path)
     critics = [run.config.algorithm.critic for run in runs]  # pyright: ignore[reportAttributeAccessIssue]
     assert critics == ["central", "told", "central"]
+
+
+def test_the_command_in_the_report_is_the_one_that_was_given():
+    """What it says of the task is understood, and trains on the same settings."""
+    usual = configuration.on_task(configuration.preset("gacrl-talk"), "colours")
+    config = configuration.from_dict({"env": {"graph": "full", "named": False, "num_agents": 4}}, usual)
+    words = talk._command(config).split()
+    assert {"--env.no-named", "--env.graph"} < set(words)
+    flags = words[words.index("--env.num-agents") :]
+    assert parsing.changed(usual.env, flags, "talk", arguments.Talk) == config.env
+    assert "--env." not in talk._command(usual)
 
 
 def test_what_cannot_talk_is_refused(tmp_path: Path):

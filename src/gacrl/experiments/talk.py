@@ -309,9 +309,22 @@ def _report(done: Talk) -> Page:
         "A task needs talk where the lower bound of told − silent is above 5 % of what silent agents gain over random "
         "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
     )
-    words = f"gacrl talk{tasks.flag(config.task)} --preset {config.preset} --seeds {config.num_seeds}"
-    page.code(f"{words} --seed {config.seed} --env-steps {config.training.env_steps}")
+    page.code(_command(config))
     return page
+
+
+def _command(config: RunConfig) -> str:
+    """Write what repeats the study: the flags, and the settings of the task that are not as usual."""
+    usual = configuration.on_task(configuration.preset(config.preset), config.task).env
+    words = [f"gacrl talk{tasks.flag(config.task)}", f"--preset {config.preset}", f"--seeds {config.num_seeds}"]
+    words += [f"--seed {config.seed}", f"--env-steps {config.training.env_steps}"]
+    for name, value in vars(config.env).items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool) and value != getattr(usual, name):
+            words.append(f"--env.{flag}" if value else f"--env.no-{flag}")
+        elif value != getattr(usual, name):
+            words.append(f"--env.{flag} {value}")
+    return " ".join(words)
 
 
 def cells(values: NDArray[np.float64]) -> list[str]:
