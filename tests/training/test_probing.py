@@ -7,6 +7,7 @@ import jax
 import pytest
 
 from gacrl.algorithms import build
+from gacrl.config import presets
 from gacrl.config.algorithms import (
     CommnetConfig,
     DialConfig,
@@ -21,7 +22,7 @@ from gacrl.config.algorithms import (
     VdnConfig,
 )
 from gacrl.config.run import TrainingConfig
-from gacrl.doctor import BEYOND
+from gacrl.doctor import BEYOND, trial
 from gacrl.envs.probes import BEST_RETURN, PROBES, SwitchRiddle
 from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.training.curriculum import constant
@@ -119,6 +120,19 @@ def test_a_baseline_learns_what_it_can(name: str):
     assert found.values["value"] == pytest.approx((1.0, 1.0), abs=0.1)
     assert found.values["discount"] == pytest.approx((0.95, 0.95), abs=0.1)
     assert found.values["observation"] == pytest.approx((-share, share), abs=0.15)
+
+
+@pytest.mark.soak
+def test_what_a_teacher_is_told_reaches_the_agents_by_words_alone():
+    """As `gacrl doctor` would probe it. Its pupils solve `message` when they talk, and not when they have no words."""
+    asked = trial(presets.preset("gacrl-talk").algorithm)
+    talking = probe_algorithm(*asked, probes=("both", "message"))
+    assert talking.returns["both"] == talking.returns["message"] == BEST_RETURN["message"] == 1.0
+    mute = replace(asked.algorithm.network, communication="none")
+    silent = probe_algorithm(
+        *asked._replace(algorithm=replace(asked.algorithm, network=mute)), probes=("message",)
+    )
+    assert abs(silent.returns["message"]) < 0.5
 
 
 @pytest.mark.soak
