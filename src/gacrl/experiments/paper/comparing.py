@@ -92,8 +92,8 @@ class _Ranking:
         """The verdict, and its numbers in the measure's own sign."""
         chance, random, test = against_random(self.values["GACRL"], self.values["random"], self.margin)
         because = (
-            f"{self.measure.label}, GACRL less each: {_listed(self.less, self.measure)}; margin {self.margin:.3g}"
-            f"{more}; {_listed({'random': random}, self.measure)}, {test}"
+            f"{self.measure.label}, GACRL less each: {_listed({**self.less, 'random': random}, self.measure)}, {test}; "
+            f"margin {self.margin:.3g}{more}"
         )
         if agreement == AGREES and self._reading.play == "greedy":
             because += _flight(self._reading, self._evidence)

@@ -14,6 +14,7 @@ from gacrl.experiments.paper.claims import (
     UNTESTED,
     Agreement,
     Claim,
+    Measure,
     Outcome,
     Reading,
     measures,
@@ -51,7 +52,7 @@ def value(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     there = [name for name, (row, _) in table.items() if evidence.has(reading.column, row.who)]
     spans = dict(zip(there, table_spans(tuple(table[name][0] for name in there), reading, evidence), strict=True))
     cells = [
-        _Cell(row.who, reading.measure(measure).label, number, ours, random)
+        _Cell(row.who, reading.measure(measure), number, ours, random, column=measures()[measure].label)
         for name, (row, numbers) in table.items()
         if name in asked
         for measure, number, ours, random in zip(row.measures, numbers, *spans[name], strict=True)
@@ -87,8 +88,9 @@ def _table(claim: Claim, reading: Reading, evidence: Evidence) -> Printed:
 class _Cell:
     """One printed number, and where it would lie."""
 
-    def __init__(self, who: str, label: str, printed: float, ours: Span, random: Span):
-        self.who, self.label, self.printed, self.ours, self.random = who, label, printed, ours, random
+    def __init__(self, who: str, measure: Measure, printed: float, ours: Span, random: Span, column: str = ""):
+        self.who, self.label, self.printed, self.ours, self.random = who, measure.label, printed, ours, random
+        self.column = column  # as it is called under any reading
         self.told = not inside(printed, random)
         wide = ours[1] - ours[0] > WIDE * (random[1] - random[0] + 2 * ROUNDING)
         self.agreement: Agreement = DISAGREES if not inside(printed, ours) else OPEN if wide else AGREES
@@ -97,7 +99,7 @@ class _Cell:
     def detail(self) -> str:
         """What is remarkable about it."""
         remarks = [self.agreement] * (self.agreement != AGREES) + [TOLD] * self.told
-        return f"{self.who} {self.label} {' and '.join(remarks)}" if remarks else ""
+        return f"{self.who} {self.column} {' and '.join(remarks)}" if remarks else ""
 
     def __str__(self) -> str:
         ours, random = (f"[{low:.3g}, {high:.3g}]" for low, high in (self.ours, self.random))
@@ -121,7 +123,7 @@ def peak(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     lines = len(evidence.trained(reading.column, "GACRL").episodes)
     cell = _Cell(
         f"best of {lines} lines,",
-        measure.label,
+        measure,
         printed,
         best_of_ours(measure, reading, evidence),
         best_of_random(measure, reading, evidence),

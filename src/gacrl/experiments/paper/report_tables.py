@@ -180,7 +180,7 @@ def _table_3_as_defined(page: Page, evidence: Evidence) -> None:
     """Mean ± standard deviation over the last episodes, as the paper has it."""
     table = paper_tables.printed()["table_3"]
     rows: list[list[str]] = []
-    chosen = ("shaped", "raw", "distance", "coverage_0.1", "coverage_theta")
+    chosen = ("shaped", "shaped_fixed", "raw", "distance", "coverage_0.1", "coverage_theta")
     for who, numbers in table["rows"].items():
         printed = dict(zip(table["columns"], numbers, strict=True))
         cells = [_plus_minus(*printed[measures()[name].printed]) for name in chosen]
