@@ -355,9 +355,10 @@ def _what_parts_are_worth(page: Page, task: Task, outcomes: Sequence[Outcome]) -
         page.table(("part", "it", "in", "with it less without", "probability that it helps"), rows)
     page.text(
         f"All {len(full.final)} metrics of the task are judged, for better and for worse. A part helps where a seed "
-        "with it ends better than one without in .95 or more of all pairs and the interval lies above .5; it costs where "
-        f"it is the other way round. That is claimed from {CLAIMED_FROM} seeds on; with fewer it says what may be. Of so "
-        "many comparisons a few come out by chance." + ("" if rows else " Here nothing may be said of any part.")
+        "with it ends better than one without in .95 or more of all pairs and the interval lies above .5; where it is "
+        f"the other way round, it costs. That is claimed from {CLAIMED_FROM} seeds on; with fewer it says what may be. "
+        "Of so many comparisons a few come out by chance."
+        + ("" if rows else " Here nothing may be said of any part.")
     )
     page.heading("The probability that a part helps")
     rows = []
