@@ -16,6 +16,7 @@ from gacrl.cli.main import main
 from gacrl.config import presets
 from gacrl.config.presets import GACRL_PARAMETERS
 from gacrl.config.run import CurriculumConfig
+from gacrl.errors import UserError
 from gacrl.experiments.paper import claims as claim_data
 from gacrl.experiments.paper import evidence, references, reproduce, spans
 from gacrl.experiments.paper import verdicts as comparisons
@@ -83,7 +84,7 @@ def series(shift: Mapping[str, float] | None = None, preset: str = "paper") -> S
 
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spans, "RESAMPLES", 1_000)
+    monkeypatch.setattr(spans, "RESAMPLES", 500)
 
 
 def bounds(name: str) -> tuple[float, float]:
@@ -495,6 +496,52 @@ def test_the_last_fifty_episodes_are_pooled_from_as_many_stretches_as_hold_them(
     assert count == 75
     assert mean["m"] == pytest.approx([2.0])  # (45 · 0 + 30 · 5) / 75
     assert sd["m"] == pytest.approx([np.sqrt((45 * 1 + 30 * (4 + 25)) / 75 - 4)])
+
+
+# Random beside them
+
+
+def test_scripted_policies_play_once_for_all_difficulties_and_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(references, "EPISODES", 20)
+    monkeypatch.setattr(references, "_AT_ONCE", 10)
+    monkeypatch.setattr(references, "SCRIPTED", ("random",))
+    config, hard, easy = series().config, (0.1, 0.2), (0.5, 0.5)
+    said: list[str] = []
+
+    def ask_for(*difficulties: tuple[float, float]) -> dict[tuple[float, float], Mapping[str, np.ndarray]]:
+        return dict(references.played(tmp_path, config, difficulties, said.append)["random"])
+
+    found = ask_for(easy, hard, easy)
+    assert said == ["playing random: 20 episodes at 2 difficulties"]
+    assert {values.shape for metrics in found.values() for values in metrics.values()} == {(20,)}
+    for metric, values in found[hard].items():
+        moves = metric in ("reward_shaped", "coverage_mean_theta")
+        assert (values == found[easy][metric]).all() != moves, metric
+    np.testing.assert_array_equal(found[hard]["coverage_mean_theta"], found[hard]["coverage_mean_0.2"])
+    np.testing.assert_array_equal(found[easy]["coverage_mean_theta"], found[easy]["coverage_mean_0.5"])
+
+    again = ask_for(hard, easy)
+    assert len(said) == 1, "read from the folder"
+    np.testing.assert_array_equal(again[hard]["reward_shaped"], found[hard]["reward_shaped"])
+    file = tmp_path / references.FILE
+    for damaged in (b"", b"PK", file.read_bytes()[:-90]):
+        file.write_bytes(damaged)
+        np.testing.assert_array_equal(ask_for(hard, easy)[easy]["reward_raw"], found[easy]["reward_raw"])
+    assert len(said) == 4, "what is damaged is played again"
+    ask_for(hard)
+    assert len(said) == 5, "and so are other difficulties"
+
+
+def test_a_run_of_other_seeds_than_planned_is_refused(tmp_path: Path):
+    run = plan(tmp_path, seeds=2)["paper", "GACRL"]
+    pretend(run, 0.0)
+    evidence.read_series(run.folder)
+    summary = json.loads((run.folder / "summary.json").read_text(encoding="utf-8"))
+    (run.folder / "summary.json").write_text(json.dumps({**summary, "seeds": [0, 7]}), encoding="utf-8")
+    with pytest.raises(UserError, match=r"holds seeds \[0, 7\], not \[0, 1\]"):
+        evidence.read_series(run.folder)
 
 
 # The whole command, on runs that are there already

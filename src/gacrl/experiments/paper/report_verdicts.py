@@ -50,7 +50,8 @@ def summary(page: Page, judged: Sequence[Judged]) -> None:
             [agreement, *(str(_count(found, agreement, chance)) for chance in _CHANCES)]
             for agreement in (AGREES, DISAGREES, OPEN, UNTESTED)
         ],
-        "Tests by what our runs say, and by whether random can be told from it",
+        "Tests by what our runs say, and by whether random can be told from the printed numbers or, where GACRL is "
+        "ranked or followed, from our GACRL",
     )
     for title, agreements in (
         ("What was reproduced", (AGREES,)),
