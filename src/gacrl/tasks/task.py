@@ -107,6 +107,9 @@ class Task(NamedTuple):
     """What a picture of a state shows (`gacrl.scene`). None: discs, where positions are known."""
     edit: Callable[[EnvState, Any], EnvState] | None = None
     """What a hand may move."""
+    world: Callable[[Any, EnvParams], Mapping[str, Any] | None] | None = None
+    """(Environment, params) -> its rules as plain data, for a page that steps the task in JavaScript (`export/page`);
+    None: such a page replays what was recorded."""
     ragged: Callable[[Settings], bool] = complete
     """Whether agents may be absent, or their lives end inside an episode."""
     comparable: tuple[str, ...] | None = None

@@ -6,6 +6,7 @@ from gacrl.tasks.navigation.environment import make
 from gacrl.tasks.navigation.scene import scene
 from gacrl.tasks.navigation.scripted import centroid, guess, told
 from gacrl.tasks.navigation.settings import METRICS, ColoursSettings, ReferenceSettings, SpeakerListenerSettings
+from gacrl.tasks.navigation.world import world
 from gacrl.tasks.task import Task, Words
 
 ANCHORS = Path(__file__).with_name("anchors")
@@ -19,6 +20,7 @@ REFERENCE = Task(
     references={"told": told, "silent": centroid},
     anchors=ANCHORS / "reference.json",
     scene=scene,
+    world=world,
     comparable=("max_cycles",),
     words=Words(mark="landmark", lit="reached"),
     summary="each of two agents knows the other's goal alone (MPE2 simple_reference_v3)",

@@ -12,6 +12,7 @@ from gacrl.tasks.spread.environment import Spread, SpreadParams, params_of
 from gacrl.tasks.spread.scene import scene
 from gacrl.tasks.spread.scripted import local, oracle, silent
 from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SCOUTS_METRICS, ScoutsSettings, SpreadSettings
+from gacrl.tasks.spread.world import world
 from gacrl.tasks.task import Part, Task, Words
 
 
@@ -80,6 +81,7 @@ TASK = Task(
     references={"oracle": oracle, "local": local},
     anchors=Path(__file__).with_name("anchors") / "spread.json",
     scene=scene,
+    world=world,
     comparable=COMPARABLE,
     ragged=ragged,
     words=Words(mark="landmark", lit="covered"),
