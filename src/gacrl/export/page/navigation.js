@@ -1,6 +1,6 @@
 // `gacrl.tasks.navigation` in JavaScript: agents without bodies seek goals that others know.
 
-import { actionForces, distanceBetween, integrate, offsetBetween, scatter } from "./physics.js";
+import { actionForces, distanceBetween, integrate, offsetBetween, scatter, thingsAround } from "./physics.js";
 import { oneHot } from "./numbers.js";
 import { randomNumbers } from "./random.js";
 
@@ -61,20 +61,14 @@ export class NavigationWorld {
     const velocity = moves[i] ? [state.velocities[2 * i], state.velocities[2 * i + 1]] : [0, 0];
     const goal = state.order[i].map((l) => Number(knows[i] >= 0 && l === state.goals[knows[i]]));
     const who = identity ? [...oneHot(i, num_agents)] : [];
-    const places = state.order[i].map((l, k) => ({
-      index: l,
-      offset: offsetBetween(state.positions, i, state.landmarks, l),
-      features: named ? [...oneHot(k, landmarks)] : [goal[k]],
-    }));
+    const features = (l) => (named ? [...oneHot(l, landmarks)] : [goal[state.order[i].indexOf(l)]]);
     const names = (j) => (identity ? [...oneHot(j, num_agents)] : []);
-    const to = (j) => offsetBetween(state.positions, i, state.positions, j);
-    const others = bodies ? this.everyone.filter((j) => j !== i) : [];
     return {
       own: named ? [...velocity, ...goal, ...who] : [...velocity, ...who],
-      landmarks: moves[i] ? places : [],
-      agents: others.map((j) => ({ index: j, offset: to(j), features: names(j) })),
+      landmarks: moves[i] ? thingsAround(state.positions, i, state.landmarks, features) : [],
+      agents: bodies ? thingsAround(state.positions, i, state.positions, names).filter((it) => it.index !== i) : [],
       speakers: hears[i],
-      sight: bodies ? (j) => [...to(j), ...names(j)] : () => [],
+      sight: bodies ? (j) => [...offsetBetween(state.positions, i, state.positions, j), ...names(j)] : () => [],
       available: Array.from({ length: 5 }, (_, action) => moves[i] || action === 0),
     };
   }
@@ -90,7 +84,7 @@ export class NavigationWorld {
     const marks = Array.from({ length: state.landmarks.length / 2 }, (_, l) => ({
       x: state.landmarks[2 * l], y: state.landmarks[2 * l + 1], radius: capture_radius, colour: l, lit: reached(l),
     }));
-    return { agents, marks, corner: 1 };
+    return { agents, marks, ground: [-1, -1, 1, 1] };
   }
 }
 

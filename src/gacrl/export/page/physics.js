@@ -14,6 +14,14 @@ export function offsetBetween(a, i, b, j) {
   return [b[2 * j] - a[2 * i], b[2 * j + 1] - a[2 * i + 1]];
 }
 
+// The things at these places as agent i sees them; features: what is known of them besides.
+export function thingsAround(positions, i, places, features = () => []) {
+  return Array.from({ length: places.length / 2 }, (_, index) => {
+    const offset = offsetBetween(positions, i, places, index);
+    return { index, offset, squared: offset[0] * offset[0] + offset[1] * offset[1], features: features(index) };
+  });
+}
+
 // The force of each agent's own action, flat.
 export function actionForces(actions, physics) {
   const forces = new Float64Array(2 * actions.length);

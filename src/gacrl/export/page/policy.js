@@ -32,8 +32,21 @@ export class Policy {
 
   // What all agents say and do. seen: what each of them sees (`world.observe`).
   // arriving(round, words): for each speaker the word that arrives of it; reaches(i, j): whether i still hears j.
-  decide(seen, arriving = (round, words) => words, reaches = () => true) {
-    const looked = seen.map((one) => this.see(one));
+  decide(seen, arriving, reaches) {
+    const work = this.deciding(seen, arriving, reaches);
+    for (;;) {
+      const { done, value } = work.next();
+      if (done) return value;
+    }
+  }
+
+  // The same, agent by agent: a page with a hundred of them draws in between.
+  *deciding(seen, arriving = (round, words) => words, reaches = () => true) {
+    const looked = [];
+    for (const one of seen) {
+      looked.push(this.see(one));
+      yield;
+    }
     const meant = looked.map((it) => it.code ?? it.hidden);
     let hidden = looked.map((it) => it.hidden);
     const heard = seen.map((one, i) => this.nearestSpeakers(one, i, reaches));
@@ -127,8 +140,7 @@ export class Policy {
 
 function nearest(things, count) {
   if (count === null || things.length <= count) return things;
-  const squared = (thing) => thing.offset[0] ** 2 + thing.offset[1] ** 2;
-  return [...things].sort((a, b) => squared(a) - squared(b)).slice(0, count);
+  return [...things].sort((a, b) => a.squared - b.squared).slice(0, count);
 }
 
 // An offset and its length, which is never quite 0.

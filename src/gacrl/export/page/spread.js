@@ -1,6 +1,6 @@
 // `gacrl.tasks.spread` in JavaScript: agents must stand on landmarks without touching each other.
 
-import { actionForces, addContactForces, distanceBetween, integrate, offsetBetween, scatter } from "./physics.js";
+import { actionForces, addContactForces, distanceBetween, integrate, offsetBetween, scatter, thingsAround } from "./physics.js";
 import { randomNumbers } from "./random.js";
 
 export class SpreadWorld {
@@ -10,7 +10,7 @@ export class SpreadWorld {
     this.least = rules.least_agents;
     this.most = rules.most_agents;
     this.length = rules.max_cycles;
-    this.rooms = Array.from({ length: 5 }, () => true);
+    this.available = Array.from({ length: 5 }, () => true);
   }
 
   // Crowded as in training: the area grows with the agents.
@@ -63,21 +63,17 @@ export class SpreadWorld {
 
   // What each agent sees, for networks over graphs of entities, and who hears whom.
   observe(state, radius) {
-    const count = state.positions.length / 2, landmarks = state.landmarks.length / 2;
-    return Array.from({ length: count }, (_, i) => {
-      const others = Array.from({ length: count }, (_, j) => j).filter((j) => j !== i);
+    return Array.from({ length: state.positions.length / 2 }, (_, i) => {
+      const agents = thingsAround(state.positions, i, state.positions);
+      agents.splice(i, 1);
       return {
         own: [state.velocities[2 * i], state.velocities[2 * i + 1]],
-        landmarks: Array.from({ length: landmarks }, (_, l) => ({
-          index: l, offset: offsetBetween(state.positions, i, state.landmarks, l), features: [],
-        })).filter(isElsewhere),
-        agents: others.map((j) => ({
-          index: j, offset: offsetBetween(state.positions, i, state.positions, j), features: [],
-        })).filter(isElsewhere),
-        // Those that it sees at its own place are heard as well, from nowhere.
-        speakers: others.filter((j) => distanceBetween(state.positions, i, state.positions, j) < radius),
+        // MPE2 pads with zeros: what is at distance 0 is not there. It is heard all the same.
+        landmarks: thingsAround(state.positions, i, state.landmarks).filter((it) => it.squared > 0),
+        agents: agents.filter((it) => it.squared > 0),
+        speakers: agents.filter((it) => it.squared < radius * radius).map((it) => it.index),
         sight: (j) => offsetBetween(state.positions, i, state.positions, j),
-        available: this.rooms,
+        available: this.available,
       };
     });
   }
@@ -95,7 +91,7 @@ export class SpreadWorld {
       agent.touching = agents.some((_, j) => j !== i
         && distanceBetween(state.positions, i, state.positions, j) < 2 * this.rules.physics.agent_radius);
     }
-    return { agents, marks, corner };
+    return { agents, marks, ground: [-corner, -corner, corner, corner] };
   }
 
   // One more agent, and a landmark where every agent has one; random: where.
@@ -118,9 +114,4 @@ export class SpreadWorld {
       landmarks: state.landmarks.slice(0, 2 * this.landmarksFor(count)),
     };
   }
-}
-
-// MPE2 pads with zeros: what is at distance 0 is not there.
-function isElsewhere(thing) {
-  return thing.offset[0] !== 0 || thing.offset[1] !== 0;
 }
