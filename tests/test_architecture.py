@@ -32,6 +32,7 @@ LAYERS = (
     ("film",),
     ("training",),
     ("experiments", "play", "api"),
+    ("export",),
     ("cli", "doctor"),
     ("__main__",),
 )

@@ -63,6 +63,11 @@ def complete(settings: Settings) -> bool:
     return False
 
 
+def unnamed(settings: Settings) -> Sequence[str]:
+    """The task does not say what its actions are called."""
+    return ()
+
+
 SILENT, TOLD = "silent", "told"
 """Among a task's references and anchors: the best policy that says nothing, and one to which everything is told."""
 MATTERS = 0.05
@@ -115,6 +120,8 @@ class Task(NamedTuple):
     comparable: tuple[str, ...] | None = None
     """Attributes of the settings that must be equal in one table; None: all."""
     words: Words = Words()
+    actions: Callable[[Settings], Sequence[str]] = unnamed
+    """What each action does, by index: it stands beside an exported policy."""
     parts: Mapping[str, Part] = MappingProxyType({})
     """Parts of an ablation that this task alone has."""
     summary: str = ""

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.checks import require
+from gacrl.envs.particles import PUSHES
 from gacrl.tasks.spread import scouts
 from gacrl.tasks.spread.environment import Spread, SpreadParams, params_of
 from gacrl.tasks.spread.scene import scene
@@ -85,6 +86,7 @@ TASK = Task(
     comparable=COMPARABLE,
     ragged=ragged,
     words=Words(mark="landmark", lit="covered"),
+    actions=lambda settings: PUSHES,
     parts={"no-coverage-bonus": Part("MPE2's reward alone", {"env": {"reward": "mpe2"}})},
     summary="agents must cover landmarks without touching each other (MPE2 simple_spread_v3)",
 )
