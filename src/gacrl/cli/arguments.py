@@ -218,7 +218,7 @@ class Render:
 
 @dataclass(frozen=True)
 class Export:
-    """Take a run elsewhere: its weights, its policy as a program, or its numbers.
+    """Take a run elsewhere: its weights, its policy as a program, a page to play with, or its numbers.
 
     A policy is one seed's: the first, or FOLDER@k's. Flags --env.X change the task's settings, as in `gacrl evaluate`:
     programs are made for one number of agents. docs/guides/export.md says what is in the files.
@@ -226,6 +226,7 @@ class Export:
     examples:
       gacrl export runs/gacrl-1 --out policy.safetensors
       gacrl export runs/gacrl-1@best --format npz --out policy.npz
+      gacrl export pretrained:gacrl-reference --out reference.html
       gacrl export runs/gacrl-1 --out metrics.csv
     """
 
@@ -234,7 +235,7 @@ class Export:
     out: Path | None = None
     """The file to write; one that exists is not overwritten without --overwrite."""
     format: str | None = None
-    """safetensors, npz or csv; none: what the name of the file says."""
+    """safetensors, npz, html or csv; none: what the name of the file says."""
     outside: ON_TASK = Outside()
     overwrite: bool = False
     """Replace a file that exists."""

@@ -80,8 +80,8 @@ def _entry(
     }
 
 
-def _commonest(values: Int[np.ndarray, " K"], weight: Float[np.ndarray, " K"], add: int = 0) -> list[float]:
-    """The value with the most weight, and its share of it."""
+def _commonest(values: Int[np.ndarray, " K"], weight: Float[np.ndarray, " K"], add: int = 0) -> list[Any]:
+    """Return the value with the most weight, and its share of it."""
     counts = np.bincount(values, weight)
     return [int(counts.argmax()) + add, round(float(counts.max() / counts.sum()), 4)]
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,15 +13,13 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import look_of
 from gacrl.export import bundle, portable, replays
 from gacrl.export.dictionary import dictionary
+from gacrl.export.source import Source
 from gacrl.export.yardsticks import yardsticks
 from gacrl.messages import interventions
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
 from gacrl.render import COVERED, SYMBOL_COLOURS, UNCOVERED
 from gacrl.types import Intervention
-
-if TYPE_CHECKING:
-    from gacrl.export.source import Source
 
 MOST_BYTES = 400_000
 HEARD = 1_000
@@ -31,7 +29,7 @@ _UNBOUNDED = 12
 """Agents at the most for a network in which every agent looks at all others: its work grows with their cube."""
 
 
-def write(source: "Source", out: Path) -> Sequence[Path]:
+def write(source: Source, out: Path) -> Sequence[Path]:
     """Write a page of at most 400 KB that needs no server. Raises UserError where nothing can be shown."""
     opened = source.opened
     data = _common(opened, source.name)
@@ -56,6 +54,7 @@ def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
         "title": f"{task.name}: {name}",
         "task": task.name,
         "summary": task.summary,
+        "actions": list(task.actions(opened.config.env)),
         "words": {"agent": words.agent, "mark": words.mark, "lit": words.lit},
         "colours": {"symbols": SYMBOL_COLOURS, "lit": COVERED, "unlit": UNCOVERED},
         "measures": {},

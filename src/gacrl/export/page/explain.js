@@ -1,7 +1,6 @@
 // Says in words what an agent sees, hears, says and does, and what a word goes with.
 
 import { colourName, letter } from "./palette.js";
-import { MOVES } from "./physics.js";
 import { FATES } from "./words.js";
 
 const COMPASS = ["to the right", "to the upper right", "above", "to the upper left", "to the left", "to the lower left", "below", "to the lower right", "here"];
@@ -21,7 +20,7 @@ export function aboutAgent(frame, index, page, rules) {
     const at = looks.map((look) => `${percent(look.share)} ${markName(scene, look.index, page.words)}`);
     lines.push(["Then looks at", at.join(", ")]);
   }
-  if (decision.actions) lines.push(["Next", MOVES[decision.actions[index]] ?? `action ${decision.actions[index]}`]);
+  if (decision.actions) lines.push(["Next", actionName(page, decision.actions[index])]);
   return lines;
 }
 
@@ -64,12 +63,16 @@ export function aboutWord(dictionary, agent, round, symbol, page) {
   const place = entry.of === "heard" && goal ? "that lies" : `the nearest ${page.words.mark} lies`;
   const where = COMPASS[entry.direction[0]];
   return `${start} ${whom}${goal || ":"} ${place} ${where} most often (${percent(entry.direction[1])}), ${far(entry.distance)} away on average; `
-    + `then it ${MOVES[entry.action[0]] ?? `takes action ${entry.action[0]}`} (${percent(entry.action[1])}).`;
+    + `the next action is “${actionName(page, entry.action[0])}” (${percent(entry.action[1])}).`;
 }
 
 export function markName(scene, index, words) {
   const { colour } = scene.marks[index];
   return colour >= 0 ? colourName(colour) : `${words.mark} ${index}`;
+}
+
+export function actionName(page, action) {
+  return page.actions[action] ?? `action ${action}`;
 }
 
 export function percent(share) {

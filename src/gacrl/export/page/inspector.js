@@ -1,9 +1,8 @@
 // The panel about one agent: what it sees, hears, says and does, the chances of its words, and what those words go with.
 
 import { byId, make, say } from "./elements.js";
-import { aboutAgent, aboutWord, percent } from "./explain.js";
+import { aboutAgent, aboutWord, actionName, percent } from "./explain.js";
 import { letter } from "./palette.js";
-import { MOVES } from "./physics.js";
 
 const LIKELY = 4;
 
@@ -43,7 +42,7 @@ export class Inspector {
       ...ranked(round[index]).map(([symbol, share]) => bar(letter(symbol), share, percent(share))),
     ]);
     const values = [...decision.values[index]], least = Math.min(...values), most = Math.max(...values);
-    const worth = values.map((value, action) => bar(MOVES[action] ?? `action ${action}`, (value - least) / (most - least || 1), value.toFixed(2)));
+    const worth = values.map((value, action) => bar(actionName(this.page, action), (value - least) / (most - least || 1), value.toFixed(2)));
     return [...parts, make("h3", {}, "What each action looks worth"), ...worth];
   }
 

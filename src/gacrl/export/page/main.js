@@ -271,7 +271,7 @@ connect(act, view);
 if (asked !== null) still.t = Math.min(asked.at, session.length);
 settle();
 still.playing = asked === null && !calm;
-globalThis.gacrlPage = { session, still, act };  // for the curious, and for tests
+globalThis.gacrlPage = { session, still, act, view };  // for the curious, and for tests
 
 let before = null;
 function frame(time) {

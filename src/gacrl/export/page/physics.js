@@ -3,7 +3,6 @@
 
 export const NO_ACTION = 0;
 export const DIRECTIONS = [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]];
-export const MOVES = ["stays", "pushes left", "pushes right", "pushes down", "pushes up"];
 
 export function distanceBetween(a, i, b, j) {
   return Math.hypot(a[2 * i] - b[2 * j], a[2 * i + 1] - b[2 * j + 1]);
