@@ -52,7 +52,9 @@ class Visit:
         self.wrong: list[str] = []
         self.asked: list[str] = []
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("console", lambda said: self.wrong.append(said.text) if said.type in ("error", "warning") else None)
+        self.page.on(
+            "console", lambda said: self.wrong.append(said.text) if said.type in ("error", "warning") else None
+        )
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(path.as_uri() + fragment)
         self.until("globalThis.gacrlPage !== undefined")
@@ -138,7 +140,9 @@ def test_dragged_landmarks_are_followed_and_thirty_agents_fit(pages: dict[str, P
 
 
 def test_a_link_shows_the_same_scene_and_nonsense_in_it_does_no_harm(pages: dict[str, Path], browser: Any):
-    visit = Visit(browser, pages["gacrl-reference"], "#seed=9&n=2&at=7&do=2:voice:0:speak:3:1,4:move:mark:1:0.5:-0.25")
+    visit = Visit(
+        browser, pages["gacrl-reference"], "#seed=9&n=2&at=7&do=2:voice:0:speak:3:1,4:move:mark:1:0.5:-0.25"
+    )
     page = visit.page
     first = visit.at(12)
     page.evaluate("gacrlPage.act.copy()")
@@ -159,7 +163,9 @@ def test_it_is_readable_on_a_phone(pages: dict[str, Path], browser: Any, scheme:
     visit = Visit(browser, pages["gacrl-reference"], "#seed=1&n=2&at=8&do=0:voice:0:silence", width=390)
     visit.page.emulate_media(color_scheme=scheme)
     assert visit.page.evaluate("document.documentElement.scrollWidth") <= 390
-    colours = visit.page.evaluate("(({color, backgroundColor}) => [color, backgroundColor])(getComputedStyle(document.body))")
+    colours = visit.page.evaluate(
+        "(({color, backgroundColor}) => [color, backgroundColor])(getComputedStyle(document.body))"
+    )
     light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in colours]
     assert abs(light[0] - light[1]) > 450, "ink stands out from paper"
     visit.close()

@@ -27,7 +27,8 @@ def source(name: str) -> str:
 def script(main: str, texts: Mapping[str, str] = MappingProxyType({})) -> str:
     """Return a module and all that it imports, what is imported first.
 
-    texts: of modules that are not the page's own. Raises ValueError where two modules have a name in common, or import each other.
+    texts: of modules that are not the page's own. Raises ValueError where two modules have a name in common, or import
+    each other.
     """
     placed: dict[str, str] = {}
     _place(main, texts, placed, ())

@@ -51,9 +51,7 @@ def dictionary(episodes: Sequence[Episode], vocabulary: int, apart: bool) -> lis
     return entries
 
 
-def _entry(
-    steps: Steps, said: Bool[np.ndarray, "K G"], group: list[int], heard: bool
-) -> dict[str, Any] | None:
+def _entry(steps: Steps, said: Bool[np.ndarray, "K G"], group: list[int], heard: bool) -> dict[str, Any] | None:
     """What goes with a word that these agents say in these steps; None where nobody says it."""
     if not said.any():
         return None

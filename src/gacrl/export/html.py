@@ -51,7 +51,7 @@ def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
     """What every page says of its run."""
     task, words = opened.task, opened.task.words
     return {
-        "title": f"{task.name}: {name}",
+        "title": f"{task.name}: {Path(name).name}",  # the page goes elsewhere: not the folders of this machine
         "task": task.name,
         "summary": task.summary,
         "actions": list(task.actions(opened.config.env)),
@@ -69,13 +69,14 @@ def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
 def _live(opened: TrainedRun) -> dict[str, Any] | None:
     """Rules and weights, for a page that plays; None where it knows one of them not."""
     task, env, params = opened.task, opened.env, opened.trainer.evaluation_params
-    rules = None if task.world is None else task.world(env, params)
+    known = None if task.world is None else task.world(env, params)
     network = portable.network(opened)
-    if rules is None or network is None:
+    if known is None or network is None:
         return None
+    rules: dict[str, Any] = {**known}
     apart = "most_agents" not in rules
     if not apart and network["settings"]["nearest_agents"] is None:
-        rules = {**rules, "most_agents": max(_UNBOUNDED, env.num_agents)}
+        rules["most_agents"] = max(_UNBOUNDED, env.num_agents)
     talks = network["settings"]["communication"] != "none"
     heard = _episodes(opened, HEARD) if talks else []
     return {
@@ -95,11 +96,10 @@ def _recorded(opened: TrainedRun) -> dict[str, Any]:
             f"{opened.task.name} does not say where things are: give its observations positions, or a scene"
         )
     config = getattr(opened.config.algorithm, "network", None)
-    talks = played[0].messages is not None and config is not None
-    silenced = _episodes(opened, REPLAYED, interventions.silence()) if talks else []
-    words: list[dict[str, Any]] = []
-    if talks and kind_of(config).sends_symbols:
-        words = dictionary(played, config.vocabulary, False)
+    silenced, words = [], []
+    if played[0].messages is not None and config is not None:
+        silenced = _episodes(opened, REPLAYED, interventions.silence())
+        words = dictionary(played, config.vocabulary, False) if kind_of(config).sends_symbols else []
     kept = _fitting(played, silenced)
     return {
         "replays": {"played": replays.replay(played[:kept]), "silenced": replays.replay(silenced[:kept])},

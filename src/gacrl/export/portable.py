@@ -26,7 +26,12 @@ def network(opened: TrainedRun) -> dict[str, Any] | None:
     config, find = getattr(opened.config.algorithm, "network", None), opened.trainer.algorithm.network
     if config is None or find is None or opened.env.continuous_actions:
         return None
-    if config.torso != "graph" or config.recurrent or config.gate or config.communication not in ("discrete", "none"):
+    if (
+        config.torso != "graph"
+        or config.recurrent
+        or config.gate
+        or config.communication not in ("discrete", "none")
+    ):
         return None
     found = find(one_seed(opened.learners, 0))
     settings = {name: getattr(config, name) for name in SETTINGS} | {"num_agents": opened.env.num_agents}

@@ -14,7 +14,7 @@ STEPS = 1000
 
 
 def replay(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
-    """Write each episode down: its scene, words, graph, actions and return so far. Raises ValueError without a scene."""
+    """Write episodes down: scene, words, graph, actions and rewards. Raises ValueError for one without a scene."""
     return [_plain(episode) for episode in episodes]
 
 
@@ -48,7 +48,11 @@ def _discs(discs: Discs, count: int) -> dict[str, Any]:
 
 def _numbers(values: Any, kind: type) -> dict[str, Any]:
     array = np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<"))
-    return {"shape": list(array.shape), "kind": np.dtype(kind).name, "data": base64.b64encode(array.tobytes()).decode()}
+    return {
+        "shape": list(array.shape),
+        "kind": np.dtype(kind).name,
+        "data": base64.b64encode(array.tobytes()).decode(),
+    }
 
 
 def _bits(values: Any) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """How the scripted policies of a task fare, step by step: what stands beside a policy that is watched."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -14,16 +14,17 @@ from gacrl.tasks.task import RETURN, Task
 from gacrl.types import Actor
 
 EPISODES = 320
+Curves: TypeAlias = dict[str, list[float]]
 
 
-def yardsticks(task: Task, env: Environment, params: Any, measures: Mapping[str, str]) -> dict[str, dict[str, list[float]]]:
+def yardsticks(task: Task, env: Environment, params: Any, measures: Mapping[str, str]) -> dict[str, Curves]:
     """Return, per scripted policy, the return so far after each step and other measures, means of 320 episodes.
 
     measures: what else, {name: measure}. For tasks whose episodes all last until the time limit.
     """
     wanted = {"return": "reward_raw", **measures}
     summed = {metric.measure for metric in (*RETURN.values(), *task.metrics.values()) if metric.over == "sum"}
-    curves: dict[str, dict[str, list[float]]] = {}
+    curves: dict[str, Curves] = {}
     for name in (name for name in reversed(references.shown(task)) if name != "noop"):
         steps = _measured(references.actor(task, name, env), env, params, wanted)
         so_far = {key: values.cumsum() if wanted[key] in summed else values for key, values in steps.items()}

@@ -9,9 +9,10 @@ const NAMED = 4;  // so many things are listed, the nearest ones
 // [[heading, sentence], …] about an agent in a frame of the live page.
 export function aboutAgent(frame, index, page, rules) {
   const { decision, seen, scene } = frame, agent = scene.agents[index], lines = [];
+  if (agent.there === false) return [["Now", "not there"]];
   if (seen) lines.push(["Sees", sees(seen[index], scene, page.words)]);
   const goal = scene.marks[agent.goal];
-  if (goal) lines.push(["Must reach", `${colourName(agent.goal)}, ${far(Math.hypot(goal.x - agent.x, goal.y - agent.y))} away${page.told ? "" : ", which it does not know"}`]);
+  if (goal) lines.push(["Must reach", `${colourName(agent.goal)}, ${far(Math.hypot(goal.x - agent.x, goal.y - agent.y))} away${page.world?.knows ? ", which it does not know" : ""}`]);
   if (!decision) return lines;
   lines.push(["Hears", hears(decision, index)]);
   if (decision.said.length > 0) lines.push(["Says", says(decision, index, rules.fates[index])]);

@@ -7,9 +7,9 @@ const COLLISIONS = "collisions";
 // The table for step t.
 export function drawGauges(page, session, t) {
   const main = session.main.frames[t], twin = session.meddled ? session.twin.frames[t] : null;
-  const names = Object.keys(page.yardsticks), rows = [["Return so far", (frame) => frame.totals.return, "return", (x) => x.toFixed(1)]];
-  if (main.scene.marks.length > 0) rows.push([`${capital(page.words.mark)}s ${page.words.lit}`, (frame) => frame.share, "share", (x) => `${Math.round(100 * x)} %`]);
-  if (page.measures[COLLISIONS]) rows.push(["Collisions so far", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
+  const names = Object.keys(page.yardsticks), rows = [["Return", (frame) => frame.totals.return, "return", (x) => x.toFixed(1)]];
+  if (main.scene.marks.length > 0) rows.push([capital(page.words.lit), (frame) => frame.share, "share", (x) => `${Math.round(100 * x)} %`]);
+  if (page.measures[COLLISIONS]) rows.push(["Collisions", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
   const comparable = session.start.count === page.world?.num_agents && main.scene.agents.length === session.start.count;
   const yardsticks = comparable ? names : [];
   const head = ["", twin ? "Here" : "Now", ...(twin ? ["Untouched"] : []), ...yardsticks];
@@ -57,12 +57,13 @@ export function drawCurves(canvas, page, session, t, theme) {
 function placeLabels(pen, labels, height) {
   pen.font = "12px system-ui, sans-serif";
   pen.textBaseline = "middle";
-  let above = -Infinity;
-  for (const label of labels.sort((a, b) => a.y - b.y)) {
-    const y = Math.min(Math.max(label.y, above + 13, 7), height - 6);
+  labels.sort((a, b) => a.y - b.y);
+  let above = -6, below = height + 6;
+  for (const label of labels) above = label.y = Math.max(label.y, above + 13);
+  for (const label of labels.toReversed()) below = label.y = Math.min(label.y, below - 13);
+  for (const label of labels) {
     pen.fillStyle = label.colour;
-    pen.fillText(label.name, label.x + 5, y);
-    above = y;
+    pen.fillText(label.name, label.x + 5, label.y);
   }
 }
 

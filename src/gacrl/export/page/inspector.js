@@ -19,7 +19,8 @@ export class Inspector {
   draw(frame, index, rules) {
     this.offer(frame.scene.agents.length, index);
     const lines = aboutAgent(frame, index, this.page, rules);
-    const words = (frame.decision?.said ?? []).map((round, r) => aboutWord(this.page.dictionary, index, r, round[index], this.page)).filter(Boolean);
+    const said = frame.scene.agents[index].there === false ? [] : frame.decision?.said ?? [];
+    const words = said.map((round, r) => aboutWord(this.page.dictionary, index, r, round[index], this.page)).filter(Boolean);
     const text = JSON.stringify([index, lines, words]);
     if (text === this.shown) return;
     this.shown = text;

@@ -249,7 +249,7 @@ function reach(rules, count) {
 function introduce() {
   say(byId("title"), page.title);
   say(byId("summary"), `${page.summary.charAt(0).toUpperCase()}${page.summary.slice(1)}.`);
-  const talks = page.dictionary.length > 0;
+  const talks = page.replays ? page.replays.silenced.length > 0 : page.network.settings.communication !== "none";
   say(byId("invitation"), invitation(talks));
   byId("talk").hidden = !talks;
   byId("hands").hidden = Boolean(page.replays);
@@ -261,6 +261,7 @@ function introduce() {
 
 function invitation(talks) {
   if (!talks) return "";
+  if (page.replays) return "The letters are what they say. Silence everyone and watch what they do without their words.";
   if (session.world.most > session.world.least) return "The letters are what they say. Drag a landmark, add agents, or silence everyone: do they need their words?";
   return "The letters are what they say. Silence an agent and watch what the others do without its words.";
 }

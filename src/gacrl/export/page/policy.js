@@ -50,13 +50,13 @@ export class Policy {
     const meant = looked.map((it) => it.code ?? it.hidden);
     let hidden = looked.map((it) => it.hidden);
     const heard = seen.map((one, i) => this.nearestSpeakers(one, i, reaches));
-    const said = [], wordShares = [], heeded = [];
+    const said = [], arrived = [], wordShares = [], heeded = [];
     for (let round = 0; round < this.rounds; round++) {
       const logits = (round === 0 ? meant : hidden).map((vector) => affine(this.talk[round].encode, vector));
       said.push(logits.map((values) => indexOfLargest(values)));
       wordShares.push(logits.map(softmax));
-      const words = arriving(round, said[round]);
-      const taken = seen.map((one, i) => this.listen(round, hidden[i], one, heard[i], words));
+      arrived.push(arriving(round, said[round]));
+      const taken = seen.map((one, i) => this.listen(round, hidden[i], one, heard[i], arrived[round]));
       hidden = taken.map((it) => it.hidden);
       heeded.push(taken.map((it) => it.shares));
     }
@@ -65,7 +65,7 @@ export class Policy {
     return {
       values,
       actions: values.map((row, i) => indexOfLargest(row, seen[i].available)),
-      said, wordShares,
+      said, arrived, wordShares,  // words [R][N], and their chances [R][N][V]
       hears: heard,  // whom each agent hears, [N][K]
       heeded,  // how much of its attention each of them has, in each round [R][N][K]
       looks: final.map((it, i) => looked[i].landmarks.map((landmark, k) => ({ index: landmark.index, share: it.shares[k] }))),

@@ -83,8 +83,9 @@ function decisionOf(t, count, words, hears, actions) {
   const everyone = Array.from({ length: count }, (_, i) => i);
   const rounds = words ? words.shape[1] : 0;
   const speakers = everyone.map((i) => everyone.filter((j) => hears && hears.values[(t * count + i) * count + j]));
+  const said = Array.from({ length: rounds }, (_, r) => everyone.map((i) => words.values[(t * rounds + r) * count + i]));
   return {
-    said: Array.from({ length: rounds }, (_, r) => everyone.map((i) => words.values[(t * rounds + r) * count + i])),
+    said, arrived: said,
     hears: speakers, heeded: [], looks: everyone.map(() => []),
     actions: actions && everyone.map((i) => actions.values[t * count + i]),
   };

@@ -142,7 +142,7 @@ export class SceneView {
   wandering(decision, speaker, [[x0, y0], [x1, y1]], fraction, attention) {
     const round = Math.min(Math.floor(fraction * decision.said.length), decision.said.length - 1);
     const part = fraction * decision.said.length - round, { pen } = this;
-    pen.fillStyle = this.symbol(decision.said[round][speaker]);
+    pen.fillStyle = this.symbol(decision.arrived[round][speaker]);
     pen.strokeStyle = this.theme.paper;
     pen.lineWidth = this.unit;
     pen.beginPath();
@@ -220,9 +220,9 @@ export class SceneView {
     pen.stroke();
   }
 
-  // What an agent says: a letter for each round; what befalls its words stands beside.
+  // What is heard of an agent: a letter for each round. A line through it: nobody does; under it: it said something else.
   bubble(decision, agent, index, fate, crowded) {
-    const symbols = decision.said.map((round) => round[index]).filter((symbol) => symbol >= 0);
+    const symbols = decision.arrived.map((round) => round[index]).filter((symbol) => symbol >= 0);
     if (symbols.length === 0) return;
     const size = (crowded ? 5.5 : 11) * this.unit, away = (Math.max(agent.radius, 6 * this.unit) + size * 0.6) * Math.SQRT1_2;
     const x = agent.x + away, y = agent.y - away;
