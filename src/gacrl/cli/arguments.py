@@ -226,6 +226,8 @@ class Export:
     examples:
       gacrl export runs/gacrl-1 --out policy.safetensors
       gacrl export runs/gacrl-1@best --format npz --out policy.npz
+      gacrl export pretrained:gacrl --out policy.onnx    pip install 'gacrl[onnx]'
+      gacrl export pretrained:gacrl-teams --num-agents 10 --out policy.stablehlo
       gacrl export pretrained:gacrl-reference --out reference.html
       gacrl export runs/gacrl-1 --out metrics.csv
     """
@@ -235,7 +237,7 @@ class Export:
     out: Path | None = None
     """The file to write; one that exists is not overwritten without --overwrite."""
     format: str | None = None
-    """safetensors, npz, html or csv; none: what the name of the file says."""
+    """safetensors, npz, stablehlo, onnx, html or csv; none: what the name of the file says."""
     outside: ON_TASK = Outside()
     overwrite: bool = False
     """Replace a file that exists."""

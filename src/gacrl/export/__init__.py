@@ -30,6 +30,10 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
     {
         "safetensors": Format("gacrl.export.safetensors", ".safetensors", "the weights that act, by name", True),
         "npz": Format("gacrl.export.npz", ".npz", "the same weights for NumPy alone", True),
+        "stablehlo": Format(
+            "gacrl.export.stablehlo", ".stablehlo", "the policy as a program, of jax.export", True
+        ),
+        "onnx": Format("gacrl.export.onnx", ".onnx", "the policy as a graph for onnxruntime", True),
         "html": Format("gacrl.export.html", ".html", "a page on which the agents act and speak, for any browser"),
         "csv": Format("gacrl.export.csv", ".csv", "every evaluation of every seed, a row each"),
     }

@@ -11,20 +11,23 @@ from gacrl.export.source import Source
 from gacrl.versions import version, versions
 
 
-def write_card(source: Source, program: Program, out: Path) -> Path:
-    """Write the card of the weights in `out` beside them, as Markdown, and return where it is."""
+def write_card(source: Source, program: Program, out: Path, checked: str = "") -> Path:
+    """Write the card of the policy in `out` beside it, as Markdown, and return where it is.
+
+    checked: what was found when the file was tried.
+    """
     path = card_of(out)
-    path.write_text(card(source, program, out.name), encoding="utf-8")
+    path.write_text(card(source, program, out.name, checked), encoding="utf-8")
     return path
 
 
-def card(source: Source, program: Program, file: str) -> str:
+def card(source: Source, program: Program, file: str, checked: str = "") -> str:
     """Return the card: task, actions, architecture, tensors, training, what the policy reaches."""
     run, config = source.opened, source.opened.config
     settings = configuration.to_dict(config)
     names = run.task.actions(config.env)
     sections = {
-        f"{file}: {config.task} by {config.algorithm.name}": _summary(source, program),
+        f"{file}: {config.task} by {config.algorithm.name}": f"{_summary(source, program)} {checked}".rstrip(),
         "Actions": _actions(names, run.env.num_actions, run.env.continuous_actions),
         "Inputs and outputs": _signature(program),
         "Architecture": _block(settings["algorithm"].get("network", settings["algorithm"])),

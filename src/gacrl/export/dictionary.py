@@ -96,4 +96,4 @@ def _steps(episode: Episode) -> Steps:
     target = np.where((goal != PLAIN) & own.any(-1), own.argmax(-1), distance.argmin(-1))
     offset = np.take_along_axis(offsets, target[:, :, None, None], axis=2)[:, :, 0]
     hears = np.ones((count, agents, agents), bool) if episode.adjacency is None else episode.adjacency
-    return Steps(symbols, hears, episode.actions, goal, offset)
+    return Steps(symbols, hears, episode.actions, np.asarray(goal), np.asarray(offset))

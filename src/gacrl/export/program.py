@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -65,6 +66,46 @@ def program(source: Source) -> Program:
     inputs = shapes | {name: remembered[name] for name in kept}
     outputs = jax.eval_shape(decide, learner, inputs)
     return Program(decide, learner, inputs, outputs, {name: fresh[name] for name in kept}, weights)
+
+
+def flattened(it: Program) -> Callable[..., list[Array]]:
+    """Return the program over its inputs in their order, with its numbers inside and its outputs in theirs.
+
+    It is as plain as can be for other programs: what no output depends on is gone, the drawing of random keys among it,
+    what depends on no input is a constant, and so is an array without elements.
+    """
+
+    def decided(*given: Array) -> list[Array]:
+        found = it.decide(it.learner, dict(zip(it.inputs, given, strict=True)))
+        return [found[name] for name in it.outputs]
+
+    closed = jax.make_jaxpr(decided)(*it.inputs.values())
+    read = live(closed.jaxpr, closed.jaxpr.outvars)
+    steps = [step for step in closed.jaxpr.eqns if any(var in read for var in step.outvars)]
+
+    def run(*given: Array) -> list[Array]:
+        known: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+        known |= dict(zip(closed.jaxpr.invars, given, strict=True))
+        for step in steps:
+            known |= dict(zip(step.outvars, _stepped(closed, step, known), strict=True))
+        return [var.val if isinstance(var, core.Literal) else known[var] for var in closed.jaxpr.outvars]
+
+    return run
+
+
+def _stepped(closed: core.ClosedJaxpr, step: core.JaxprEqn, known: dict[Any, Any]) -> list[Any]:
+    """Return what a step of a program makes of the arrays so far: NumPy's where it needs no input for it."""
+    if all(var.aval.size == 0 for var in step.outvars):
+        return [np.zeros(var.aval.shape, var.aval.dtype) for var in step.outvars]
+    if step.primitive.name == "concatenate":
+        step = step.replace(invars=[var for var in step.invars if var.aval.size])
+    needed = list(dict.fromkeys(var for var in step.invars if isinstance(var, core.Var)))
+    alone = closed.jaxpr.replace(constvars=(), invars=needed, outvars=step.outvars, eqns=[step])
+    given = [known[var] for var in needed]
+    constant = all(isinstance(array, np.ndarray) for array in given)
+    with jax.ensure_compile_time_eval() if constant else nullcontext():
+        found = core.jaxpr_as_fun(closed.replace(jaxpr=alone, consts=()))(*given)
+        return list(map(np.asarray, found)) if constant else found
 
 
 def _present(seen: Observation, alive: Array) -> Observation:
