@@ -5,11 +5,11 @@ import { byId } from "./elements.js";
 const NUDGE = 0.05;
 const REACH = 1.6;  // a thing is caught within so many of its radii
 
-// act: {toggle, step, seek, rewind, fresh, faster, add, remove, next, nudge, silence, radius, cut, grab, drag, drop, hover}.
+// act: what can be done, as `main.js` has it; view: the picture that the pointer is on.
 export function connect(act, view) {
   const buttons = {
     play: act.toggle, back: () => act.step(-1), forward: () => act.step(1), rewind: act.rewind, fresh: act.fresh,
-    fewer: act.remove, more: act.add, cut: () => act.cut(Number(byId("cut-a").value), Number(byId("cut-b").value)), copy: act.copy,
+    fewer: act.remove, more: act.add, cut: () => act.cut(Number(byId("cut-a").value), Number(byId("cut-b").value)), copy: act.copy, hush: act.hush,
   };
   for (const [id, does] of Object.entries(buttons)) byId(id).addEventListener("click", does);
   byId("scrub").addEventListener("input", (event) => act.seek(Number(event.target.value)));

@@ -115,6 +115,12 @@ const act = {
     const silent = agents.every((agent) => fates[agent]?.kind === "silence");
     act.fate(agents, silent ? null : { kind: "silence" });
   },
+  // The first thing to try: everyone silent from the start, or as before.
+  hush() {
+    act.silence(true);
+    act.rewind();
+    still.playing = true;
+  },
   radius(value) {
     changed({ kind: "radius", value });
   },
@@ -228,6 +234,8 @@ function panels(t, rules) {
   byId("more").disabled = count >= session.world.most;
   byId("fewer").disabled = count <= session.world.least;
   say(byId("verdict"), verdict(page, session, t));
+  const silent = Object.values(rules.fates).filter((fate) => fate.kind === "silence").length >= count;
+  say(byId("hush"), silent ? "Let them speak" : "Silence them all");
   view.canvas.setAttribute("aria-label", `${count} agents, ${frame.scene.marks.length} ${page.words.mark}s, step ${t}`);
   reach(rules, count);
   voices.draw(t, still.selected);
@@ -251,7 +259,7 @@ function introduce() {
   say(byId("summary"), `${page.summary.charAt(0).toUpperCase()}${page.summary.slice(1)}.`);
   const talks = page.replays ? page.replays.silenced.length > 0 : page.network.settings.communication !== "none";
   say(byId("invitation"), invitation(talks));
-  byId("talk").hidden = !talks;
+  byId("talk").hidden = byId("hush").hidden = !talks;
   byId("hands").hidden = Boolean(page.replays);
   byId("team").hidden = session.world.most === session.world.least;
   byId("reach").hidden = page.world?.kind !== "spread";
