@@ -22,7 +22,7 @@ TASKS = tuple(f"tasks.{path.parent.name}" for path in sorted((PACKAGE / "tasks")
 SETTINGS_OF_TASKS = tuple(f"{task}.settings" for task in TASKS)
 
 LAYERS = (
-    ("errors", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
+    ("errors", "extras", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
     ("cli.arguments", "cli.tables", "envs", "messages.interventions", "networks", "report", "scene"),
     ("tasks.own", *TASKS),
     ("algorithms",),
@@ -32,6 +32,7 @@ LAYERS = (
     ("film",),
     ("training",),
     ("experiments", "play", "api"),
+    ("export",),
     ("cli", "doctor"),
     ("__main__",),
 )

@@ -94,6 +94,21 @@ def open_run(
     return TrainedRun(str(run), changed, trainer, learners, found.env_steps)
 
 
+def open_one(
+    run: str | Path,
+    change: Callable[[Any], Any] = lambda settings: settings,
+    warn: Callable[[str], None] = lambda sentence: None,
+) -> TrainedRun:
+    """Open a single member of a run: the first where none is named. Raises UserError as `open_run` does."""
+    path, member, kind = _split(str(run))
+    return open_run(f"{path}@{member or 0}{'@best' if kind == checkpoint.BEST else ''}", change, warn)
+
+
+def folder_of(run: str | Path) -> RunFolder:
+    """Return the run folder that `RUN` names. Raises UserError where there is none."""
+    return RunFolder.open(_split(str(run))[0])
+
+
 def _require_playable(path: Path, trained: RunConfig, asked: RunConfig) -> None:
     before, now = (tasks.find(config.task).make(config.env).num_agents for config in (trained, asked))
     if getattr(trained.algorithm, "fixed_team", False) and before != now:
@@ -154,9 +169,8 @@ def save_policy(run: str | Path, out: Path) -> Path:
     """
     if out.exists():
         raise UserError(f"{out} exists: choose another folder")
-    path, member, kind = _split(str(run))
-    opened = open_run(f"{path}@{member or 0}{'@best' if kind == checkpoint.BEST else ''}")
-    config = replace(RunFolder.open(path).config(), seed=opened.config.seed, num_seeds=1)
+    opened = open_one(run)
+    config = replace(folder_of(run).config(), seed=opened.config.seed, num_seeds=1)
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
     tensors = checkpoint.serialise(checkpoint.arrays(Acting(opened.learners)))

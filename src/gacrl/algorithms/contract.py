@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 from gacrl.algorithms.replay import Replay
+from gacrl.networks.agent import AgentNetwork
 from gacrl.types import Learner, Memory, Metrics, Policy, PRNGKey, Rollout
 
 Hyper: TypeAlias = Any
@@ -28,6 +29,8 @@ class Algorithm(NamedTuple):
     """The configured numbers, to hand to `init` as they are or varied."""
     acting: Callable[[Learner], Learner] = lambda learner: learner
     """The same learner without what only learning needs, () in its place: `policy` takes it as well."""
+    network: Callable[[Learner], AgentNetwork] | None = None
+    """The network of the greedy policy, where that takes the largest available number of its head and no more."""
     parameters: Callable[[Learner], Any] = lambda learner: learner
     """The numbers that are learned."""
     learned: Callable[[Learner], Learner] = lambda learner: learner

@@ -140,6 +140,7 @@ def make(
             planned_updates=max(1.0, training.env_steps / per_update),
         ),
         acting=lambda learner: learner._replace(optimizer=()),
+        network=None if config.symmetric_play else lambda learner: learner.network.actor,
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(optimizer=(), updates=(), hyper=(), exploration=()),
         splits_envs=True,

@@ -179,6 +179,7 @@ def make(
             planned_steps=training.env_steps,
         ),
         acting=acting,
+        network=None if config.symmetric_play else partial(playing, config.averaged),
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
         replay=lambda learner: learner.replay,
@@ -196,6 +197,11 @@ def agents_alone(config: QLearningConfig, env: Environment) -> Callable[[PRNGKey
         return Network(AgentNetwork(env, settings, num_choices, agent_key), ())
 
     return networks
+
+
+def playing(averaged: bool, learner: LearnerState) -> AgentNetwork:
+    """Return the network that plays greedily."""
+    return (learner.target if averaged else learner.network).agent
 
 
 def acting(learner: LearnerState) -> LearnerState:

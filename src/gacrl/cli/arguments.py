@@ -217,6 +217,35 @@ class Render:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Take a run elsewhere: its weights, its policy as a program, a page to play with, or its numbers.
+
+    A policy is one seed's: the first, or FOLDER@k's. Flags --env.X change the task's settings, as in `gacrl evaluate`:
+    programs are made for one number of agents. docs/guides/export.md says what is in the files.
+
+    examples:
+      gacrl export runs/gacrl-1 --out policy.safetensors
+      gacrl export runs/gacrl-1@best --format npz --out policy.npz
+      gacrl export pretrained:gacrl --out policy.onnx    pip install 'gacrl[onnx]'
+      gacrl export pretrained:gacrl-teams --num-agents 10 --out policy.stablehlo
+      gacrl export pretrained:gacrl-reference --out reference.html
+      gacrl export runs/gacrl-1 --out metrics.csv
+    """
+
+    run: tyro.conf.Positional[str]
+    """A run folder; FOLDER@k for its k-th seed, from 0; FOLDER@best for its best policy; or pretrained:NAME."""
+    out: Path | None = None
+    """The file to write; one that exists is not overwritten without --overwrite."""
+    format: str | None = None
+    """safetensors, npz, stablehlo, onnx, html or csv; none: what the name of the file says."""
+    outside: ON_TASK = Outside()
+    overwrite: bool = False
+    """Replace a file that exists."""
+    json: bool = False
+    """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare finished runs: interquartile means over seeds with 95 % intervals, differences, chances to be better.
 

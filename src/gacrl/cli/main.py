@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
 from gacrl.cli import output, stopwatch, studies
+from gacrl.cli.export import export
 from gacrl.cli.stopping import stopping
 from gacrl.cli.words import Words
 from gacrl.config import files as configuration
@@ -38,6 +39,7 @@ usage: gacrl COMMAND [OPTIONS]
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
   render     watch a run, random, noop or oracle: a GIF or MP4
+  export     take a run elsewhere: weights, a program, its numbers
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
@@ -488,6 +490,7 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "resume": _resume,
     "evaluate": _evaluate,
     "render": _render,
+    "export": export,
     "compare": _compare,
     "reproduce": studies.reproduce,
     "ablate": studies.ablate,
@@ -498,5 +501,8 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "config": _config,
     "doctor": _doctor,
 }
-_ON_TASK = ("train", "resume", "evaluate", "render", "compare", "ablate", "talk", "sweep", "tasks", "config")
+_ON_TASK = (
+    *("train", "resume", "evaluate", "render", "export", "compare"),
+    *("ablate", "talk", "sweep", "tasks", "config"),
+)
 """Commands that take a task from outside."""

@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float
 NO_ACTION, LEFT, RIGHT, DOWN, UP = range(5)
 DIRECTIONS = ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
 """The unit force of each discrete action, in MPE2's order."""
+PUSHES = ("no push", "push left", "push right", "push down", "push up")
+"""What they are called."""
 
 
 class Physics(NamedTuple):

@@ -63,6 +63,11 @@ def complete(settings: Settings) -> bool:
     return False
 
 
+def unnamed(settings: Settings) -> Sequence[str]:
+    """The task does not say what its actions are called."""
+    return ()
+
+
 SILENT, TOLD = "silent", "told"
 """Among a task's references and anchors: the best policy that says nothing, and one to which everything is told."""
 MATTERS = 0.05
@@ -107,11 +112,16 @@ class Task(NamedTuple):
     """What a picture of a state shows (`gacrl.scene`). None: discs, where positions are known."""
     edit: Callable[[EnvState, Any], EnvState] | None = None
     """What a hand may move."""
+    world: Callable[[Any, EnvParams], Mapping[str, Any] | None] | None = None
+    """(Environment, params) -> its rules as plain data, for a page that steps the task in JavaScript (`export/page`);
+    None: such a page replays what was recorded."""
     ragged: Callable[[Settings], bool] = complete
     """Whether agents may be absent, or their lives end inside an episode."""
     comparable: tuple[str, ...] | None = None
     """Attributes of the settings that must be equal in one table; None: all."""
     words: Words = Words()
+    actions: Callable[[Settings], Sequence[str]] = unnamed
+    """What each action does, by index: it stands beside an exported policy."""
     parts: Mapping[str, Part] = MappingProxyType({})
     """Parts of an ablation that this task alone has."""
     summary: str = ""

@@ -7,7 +7,7 @@ from gacrl.scene import PLAIN, Scene, compose, discs
 from gacrl.tasks.navigation.environment import NavigationParams, NavigationState
 from gacrl.tasks.navigation.settings import RADII, NavigationSettings
 
-_SIZE = 0.08
+SIZE = 0.08
 """Arena units: bodies do not touch, so that any radius would do."""
 
 
@@ -19,7 +19,7 @@ def scene(settings: NavigationSettings, state: NavigationState, params: Navigati
     sought = (state.goals[:, None] == jnp.arange(state.landmarks.shape[0])[None]) & seeks[:, None]
     corner = jnp.ones(2)
     return compose(
-        agents=discs(state.positions, _SIZE, colour=jnp.where(seeks, state.goals, PLAIN)),
+        agents=discs(state.positions, SIZE, colour=jnp.where(seeks, state.goals, PLAIN)),
         marks=discs(
             state.landmarks,
             reached,

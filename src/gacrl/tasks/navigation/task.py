@@ -2,11 +2,27 @@
 
 from pathlib import Path
 
+from gacrl.envs.particles import PUSHES
 from gacrl.tasks.navigation.environment import make
 from gacrl.tasks.navigation.scene import scene
 from gacrl.tasks.navigation.scripted import centroid, guess, told
-from gacrl.tasks.navigation.settings import METRICS, ColoursSettings, ReferenceSettings, SpeakerListenerSettings
+from gacrl.tasks.navigation.settings import (
+    METRICS,
+    ColoursSettings,
+    NavigationSettings,
+    ReferenceSettings,
+    SpeakerListenerSettings,
+)
+from gacrl.tasks.navigation.world import world
 from gacrl.tasks.task import Task, Words
+
+
+def actions(settings: NavigationSettings) -> list[str]:
+    """Name the pushes; with a word before each where utterances are actions."""
+    env = make(settings)
+    says = [f"say {word}, " for word in range(env.rules.words)] if env.utters else [""]
+    return [word + push for word in says for push in PUSHES]
+
 
 ANCHORS = Path(__file__).with_name("anchors")
 
@@ -19,8 +35,10 @@ REFERENCE = Task(
     references={"told": told, "silent": centroid},
     anchors=ANCHORS / "reference.json",
     scene=scene,
+    world=world,
     comparable=("max_cycles",),
     words=Words(mark="landmark", lit="reached"),
+    actions=actions,
     summary="each of two agents knows the other's goal alone (MPE2 simple_reference_v3)",
 )
 

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.checks import require
+from gacrl.envs.particles import PUSHES
 from gacrl.tasks.spread import scouts
 from gacrl.tasks.spread.environment import Spread, SpreadParams, params_of
 from gacrl.tasks.spread.scene import scene
 from gacrl.tasks.spread.scripted import local, oracle, silent
 from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SCOUTS_METRICS, ScoutsSettings, SpreadSettings
+from gacrl.tasks.spread.world import world
 from gacrl.tasks.task import Part, Task, Words
 
 
@@ -80,9 +82,11 @@ TASK = Task(
     references={"oracle": oracle, "local": local},
     anchors=Path(__file__).with_name("anchors") / "spread.json",
     scene=scene,
+    world=world,
     comparable=COMPARABLE,
     ragged=ragged,
     words=Words(mark="landmark", lit="covered"),
+    actions=lambda settings: PUSHES,
     parts={"no-coverage-bonus": Part("MPE2's reward alone", {"env": {"reward": "mpe2"}})},
     summary="agents must cover landmarks without touching each other (MPE2 simple_spread_v3)",
 )

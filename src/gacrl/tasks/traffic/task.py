@@ -45,5 +45,6 @@ TASK = Task(
     comparable=COMPARABLE,
     ragged=ragged,
     words=Words(agent="car"),
+    actions=lambda settings: ("drive", "brake"),
     summary="cars must cross junctions without a crash, and see next to nothing of each other (IC3Net)",
 )

@@ -1,0 +1,79 @@
+"""Modules, style, text and data as one page that needs no other file and may load none.
+
+The modules are plain ES modules in `page/`. A page is opened from disk, where modules cannot import each other, so they
+stand one after the other in a single script: imports and the word `export` are taken out, and nothing else.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Mapping
+from importlib import resources
+from types import MappingProxyType
+from typing import Any
+
+_IMPORT = re.compile(r'^import \{[^}]*\} from "\./([\w-]+\.js)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:class|const|function|let) )", re.MULTILINE)
+_NAME = re.compile(r"^(?:class|const|let|(?:async )?function\*?) (\w+)", re.MULTILINE)
+
+
+def source(name: str) -> str:
+    """Read a file of the page."""
+    return (resources.files("gacrl.export") / "page" / name).read_text(encoding="utf-8")
+
+
+def script(main: str, texts: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a module and all that it imports, what is imported first.
+
+    texts: of modules that are not the page's own. Raises ValueError where two modules have a name in common, or import
+    each other.
+    """
+    placed: dict[str, str] = {}
+    _place(main, texts, placed, ())
+    owner: dict[str, str] = {}
+    for module, text in placed.items():
+        for name in _NAME.findall(text):
+            if name in owner:
+                raise ValueError(f"{module} and {owner[name]} both have {name}")
+            owner[name] = module
+    return "\n".join(f"// --- {module}\n{text}" for module, text in placed.items())
+
+
+def _place(module: str, texts: Mapping[str, str], placed: dict[str, str], above: tuple[str, ...]) -> None:
+    if module in above:
+        raise ValueError(f"{module} imports itself by way of others")
+    if module in placed:
+        return
+    text = texts[module] if module in texts else source(module)
+    for imported in _IMPORT.findall(text):
+        _place(imported, texts, placed, (*above, module))
+    placed[module] = _EXPORT.sub("", _IMPORT.sub("", text))
+
+
+def page(title: str, data: Mapping[str, Any]) -> str:
+    """Return the page. Its policy lets it run its own script and style, and load nothing; texts are escaped."""
+    code, style = script("main.js"), source("page.css")
+    allowed = (
+        "default-src 'none'",
+        f"script-src '{_digest(code)}'",
+        f"style-src '{_digest(style)}'",
+        "base-uri 'none'",
+        "form-action 'none'",
+    )
+    plain = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for mark in "<>&\u2028\u2029":  # no text can end the element that it stands in
+        plain = plain.replace(mark, f"\\u{ord(mark):04x}")
+    parts = {
+        "policy": html.escape("; ".join(allowed), quote=True),
+        "title": html.escape(title),
+        "style": style,
+        "data": plain,
+        "script": code,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))
+
+
+def _digest(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

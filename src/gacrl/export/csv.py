@@ -1,0 +1,26 @@
+"""The numbers of a run as a table: every evaluation of every seed is a row."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from gacrl.errors import UserError
+from gacrl.export.source import Source
+from gacrl.training.trackers.rows import flat
+
+
+def write(source: Source, out: Path) -> Sequence[Path]:
+    """Write `metrics.jsonl` as CSV. Names are joined by dots: `greedy.return_agent_mean`.
+
+    Raises UserError for a run that was not evaluated yet, as a shipped one.
+    """
+    folder = source.folder
+    rows = [flat(row) for row in folder.metrics()] if folder.metrics_file.is_file() else []
+    if not rows:
+        raise UserError(f"{source.name} has no metrics.jsonl with an evaluation in it: train first")
+    columns = dict.fromkeys(name for row in rows for name in row)
+    with out.open("w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, columns, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+    return [out]

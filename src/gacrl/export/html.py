@@ -1,0 +1,125 @@
+"""A run as one page: where the page knows task and network it steps them itself, else it replays what was recorded."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gacrl.errors import UserError
+from gacrl.evaluation.episodes import Episode, record_many, written_whole
+from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation.references import look_of
+from gacrl.export import bundle, portable, replays
+from gacrl.export.dictionary import dictionary
+from gacrl.export.source import Source
+from gacrl.export.yardsticks import yardsticks
+from gacrl.messages import interventions
+from gacrl.networks.communication import kind_of
+from gacrl.play import TrainedRun
+from gacrl.render import COVERED, SYMBOL_COLOURS, UNCOVERED
+from gacrl.types import Intervention
+
+MOST_BYTES = 400_000
+HEARD = 1_000
+"""Recorded episodes that the dictionary is counted in."""
+REPLAYED = 8
+_UNBOUNDED = 12
+"""Agents at the most for a network in which every agent looks at all others: its work grows with their cube."""
+
+
+def write(source: Source, out: Path) -> Sequence[Path]:
+    """Write a page of at most 400 KB that needs no server. Raises UserError where nothing can be shown."""
+    opened = source.opened
+    data = _common(opened, source.name)
+    live = _live(opened)
+    data |= _recorded(opened) if live is None else live
+    text = bundle.page(f"{data['title']} · gacrl", data)
+    size = len(text.encode())
+    if size > MOST_BYTES:
+        raise UserError(
+            f"the page would have {size:,} bytes, and a page has at most {MOST_BYTES:,}: train a narrower network, or "
+            "export npz"
+        )
+    with written_whole(out) as file:
+        file.write(text.encode())
+    return [out]
+
+
+def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
+    """What every page says of its run."""
+    task, words = opened.task, opened.task.words
+    return {
+        "title": f"{task.name}: {Path(name).name}",  # the page goes elsewhere: not the folders of this machine
+        "task": task.name,
+        "summary": task.summary,
+        "actions": list(task.actions(opened.config.env)),
+        "words": {"agent": words.agent, "mark": words.mark, "lit": words.lit},
+        "colours": {"symbols": SYMBOL_COLOURS, "lit": COVERED, "unlit": UNCOVERED},
+        "measures": {},
+        "yardsticks": {},
+        "dictionary": [],
+        "world": None,
+        "network": None,
+        "replays": None,
+    }
+
+
+def _live(opened: TrainedRun) -> dict[str, Any] | None:
+    """Rules and weights, for a page that plays; None where it knows one of them not."""
+    task, env, params = opened.task, opened.env, opened.trainer.evaluation_params
+    known = None if task.world is None else task.world(env, params)
+    network = portable.network(opened)
+    if known is None or network is None:
+        return None
+    rules: dict[str, Any] = {**known}
+    apart = "most_agents" not in rules
+    if not apart and network["settings"]["nearest_agents"] is None:
+        rules["most_agents"] = max(_UNBOUNDED, env.num_agents)
+    talks = network["settings"]["communication"] != "none"
+    heard = _episodes(opened, HEARD) if talks else []
+    return {
+        "world": rules,
+        "network": network,
+        "measures": rules["measures"],
+        "yardsticks": yardsticks(task, env, params, rules["measures"]),
+        "dictionary": dictionary(heard, network["settings"]["vocabulary"], apart) if heard else [],
+    }
+
+
+def _recorded(opened: TrainedRun) -> dict[str, Any]:
+    """Episodes as they are, and silenced ones from the same starts where the policy speaks."""
+    played = _episodes(opened, REPLAYED)
+    if played[0].scene is None:
+        raise UserError(
+            f"{opened.task.name} does not say where things are: give its observations positions, or a scene"
+        )
+    config = getattr(opened.config.algorithm, "network", None)
+    silenced, words = [], []
+    if played[0].messages is not None and config is not None:
+        silenced = _episodes(opened, REPLAYED, interventions.silence())
+        words = dictionary(played, config.vocabulary, False) if kind_of(config).sends_symbols else []
+    kept = _fitting(played, silenced)
+    return {
+        "replays": {"played": replays.replay(played[:kept]), "silenced": replays.replay(silenced[:kept])},
+        "dictionary": words,
+    }
+
+
+def _fitting(*groups: list[Episode]) -> int:
+    """How many episodes of each group go into half of a page."""
+    size = sum(_bytes(group[0]) for group in groups if group)
+    return int(np.clip(MOST_BYTES // 2 // max(size, 1), 1, REPLAYED))
+
+
+def _bytes(episode: Episode) -> int:
+    return sum(len(part) for part in map(str, replays.replay([episode])))
+
+
+def _episodes(opened: TrainedRun, count: int, intervention: Intervention | None = None) -> list[Episode]:
+    """Record greedy play from the starts of the closing evaluation."""
+    happens = opened.trainer.intervention if intervention is None else intervention
+    play = partial(record_many, opened.env, opened.policy(0, False), opened.trainer.memory)
+    look = look_of(opened.task, opened.config.env)
+    return play(opened.trainer.evaluation_params, stream_key("report"), count, happens, look)

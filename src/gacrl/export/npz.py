@@ -1,0 +1,18 @@
+"""The weights for programs that have NumPy alone."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gacrl.export.card import write_card
+from gacrl.export.program import program
+from gacrl.export.source import Source
+
+
+def write(source: Source, out: Path) -> Sequence[Path]:
+    """Write the weights that act, by name, and their card. No array in it is an object: nothing is pickled."""
+    it = program(source)
+    with out.open("wb") as file:
+        np.savez(file, **it.weights)
+    return [out, write_card(source, it, out)]

@@ -1,0 +1,62 @@
+"""The policy as an ONNX graph, converted by jax2onnx from the traced program and checked with onnxruntime."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gacrl.errors import UserError
+from gacrl.export.card import write_card
+from gacrl.export.program import Program, flattened, program
+from gacrl.export.recorded import Arrays, compared
+from gacrl.export.source import Source
+from gacrl.extras import require_extra
+
+OPSET = 21
+"""The newest that onnxruntime 1.20, of 2024, reads."""
+
+
+def write(source: Source, out: Path) -> Sequence[Path]:
+    """Write the policy, its weights inside, and its card.
+
+    Raises UserError where jax2onnx or onnxruntime is missing, or where jax2onnx cannot convert the network.
+    """
+    require_extra("onnx", "jax2onnx", "onnxruntime")
+    it = program(source)
+    data = convert(source, it)
+    checked = compared(source, it, runner(data))
+    out.write_bytes(data)
+    return [out, write_card(source, it, out, f"{checked} Opset {OPSET}.")]
+
+
+def convert(source: Source, it: Program) -> bytes:
+    """Return the program as a serialised ONNX model of opset 21."""
+    from jax2onnx import to_onnx
+
+    try:
+        model = to_onnx(
+            flattened(it),
+            list(it.inputs.values()),
+            model_name=f"gacrl {source.opened.config.task}",
+            opset=OPSET,
+            input_names=list(it.inputs),
+            output_names=list(it.outputs),
+        )
+    except Exception as error:  # a dozen kinds, one for each primitive
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"jax2onnx cannot convert the policy of {source.name} ({why}): take stablehlo") from error
+    return model.SerializeToString()
+
+
+def runner(data: bytes):
+    """Return a function that runs the model on one core: inputs by name -> outputs by name."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3  # it warns of every weight that it folds
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+
+    def run(inputs: Arrays) -> Arrays:
+        return dict(zip(names, session.run(names, inputs), strict=True))
+
+    return run

@@ -1,0 +1,19 @@
+"""The weights as safetensors, which any framework reads."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import safetensors.numpy
+
+from gacrl.export.card import write_card
+from gacrl.export.program import program
+from gacrl.export.source import Source
+from gacrl.versions import version
+
+
+def write(source: Source, out: Path) -> Sequence[Path]:
+    """Write the weights that act, by name, and their card; the file's metadata say what it is of."""
+    it, run = program(source), source.opened
+    about = {"format": "gacrl", "gacrl": version(), "task": run.config.task, "preset": run.config.preset}
+    safetensors.numpy.save_file(it.weights, str(out), metadata=about)
+    return [out, write_card(source, it, out)]

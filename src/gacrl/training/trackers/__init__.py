@@ -1,0 +1,1 @@
+"""Readers of a training that write it down elsewhere."""
