@@ -221,12 +221,12 @@ def record_many(
         ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
             keys = jax.random.split(key, (num_episodes, 3))
             after, step = rollout.act(env, policy, params, carry, keys, intervention)
-            seen = _view(look, after.env_state, step.next_observation, params)
+            seen = seen_of(look, after.env_state, step.next_observation, params)
             return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
 
         start_key, act_key = jax.random.split(key)
         carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
-        opening = _view(look, carry.env_state, carry.observation, params)
+        opening = seen_of(look, carry.env_state, carry.observation, params)
         _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
         scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
         return _Played(
@@ -245,7 +245,7 @@ def record_many(
     return [_episode(played, k) for k in range(num_episodes)]
 
 
-def _view(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
+def seen_of(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
     """Return what is to be seen of each environment [E, …]: discs where nobody says how to look."""
     if look is not None:
         return jax.vmap(look, (0, None))(state, params)
@@ -270,11 +270,11 @@ def _episode(played: _Played, k: int) -> Episode:
         reward=np.array(played.reward[:steps, k]),
         reward_raw=np.array(played.reward_raw[:steps, k]),
         agent_mask=np.array(played.agent_mask[:steps, k]),
-        scene=_sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
+        scene=sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
     )
 
 
-def _sized(scene: Scene | None) -> Scene | None:
+def sized(scene: Scene | None) -> Scene | None:
     """Agents without a radius get one that suits the picture: a twentieth of the way that all of them cover."""
     if scene is None or scene.agents.radius.any():
         return scene
