@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gacrl.evaluation.summary import Estimate
     from gacrl.messages.interventions import delay, drop, noise, scramble, silence, swap
     from gacrl.play import LoadedPolicy, load_policy
+    from gacrl.tasks.foreign.pettingzoo import from_pettingzoo
     from gacrl.tasks.task import Metric, Task
     from gacrl.training.watching import Watcher
     from gacrl.types import Arrives, Intervention
@@ -45,6 +46,7 @@ _HOMES = {
     "delay": "gacrl.messages.interventions",
     "drop": "gacrl.messages.interventions",
     "evaluate": "gacrl.api",
+    "from_pettingzoo": "gacrl.tasks.foreign.pettingzoo",
     "iterate": "gacrl.api",
     "load_policy": "gacrl.play",
     "make_env": "gacrl.api",
@@ -78,6 +80,7 @@ __all__ = [  # the keys of _HOMES, spelled out for type checkers
     "delay",
     "drop",
     "evaluate",
+    "from_pettingzoo",
     "iterate",
     "load_policy",
     "make_env",

@@ -376,7 +376,7 @@ def _render(words: Words) -> int:
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
     happens = _intervention(asked.messages)
     shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
-    if shown.episodes[0].scene is None:
+    if not shown.episodes[0].visible:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )

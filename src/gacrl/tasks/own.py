@@ -24,6 +24,7 @@ from gacrl.envs.environment import Environment, TimeStep
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.scene import Scene
 from gacrl.tasks import Own
+from gacrl.tasks.foreign import pettingzoo
 from gacrl.tasks.task import RETURN, Task
 from gacrl.types import Observation
 
@@ -38,7 +39,7 @@ class NoSettings:
 def bring(env: Any) -> tuple[str, Any]:
     """Have a task at hand; returns its name, and the settings that stand where none are said.
 
-    env: the name of a task, `FILE.py:NAME`, a `Task`, a subclass of `Environment` or an instance of one. Raises
+    env: the name of a task, `FILE.py:NAME`, `pettingzoo:MODULE`, a `Task`, a subclass of `Environment` or an instance of one. Raises
     ConfigError, with one sentence, for what is none of these, or for a task that does not keep its word.
     """
     if isinstance(env, str):
@@ -54,6 +55,11 @@ def bring(env: Any) -> tuple[str, Any]:
 
 
 def _by_name(name: str) -> str:
+    if name.startswith(pettingzoo.SCHEME):
+        own = pettingzoo.by_module(name)
+        examine(own)
+        tasks.bring(own)
+        return name
     path, colon, attribute = name.rpartition(":")
     if not colon or not path.endswith(".py"):
         tasks.find(name)

@@ -19,7 +19,7 @@ from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task
 from gacrl.training.forecast import closing_seconds, seconds_left
 from gacrl.training.recorder import SHOWN_EPISODES
-from gacrl.training.trainer import ChunkReport, Trainer, TrainState
+from gacrl.training.trainer import AbstractTrainer, ChunkReport, TrainState
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Progress:
 
 
 def train(
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     config: RunConfig,
     state: TrainState,
     env_steps: int = 0,
@@ -85,7 +85,7 @@ def train(
         if chunk is None:
             on_compile()
             begun = time.perf_counter()
-            chunk = trainer.chunk.lower(state, updates).compile()
+            chunk = trainer.compiled(state, updates)
             compiling += time.perf_counter() - begun
             wait_for_all()
         begun = time.perf_counter()
@@ -118,7 +118,7 @@ def train(
         yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole, left)
 
 
-def _closing(trainer: Trainer, config: RunConfig, compiling: float, playing: float) -> float:
+def _closing(trainer: AbstractTrainer, config: RunConfig, compiling: float, playing: float) -> float:
     """Seconds that will pass after the last chunk."""
     more = config.evaluation.final_episodes / config.evaluation.num_episodes
     return closing_seconds(

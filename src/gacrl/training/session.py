@@ -15,7 +15,7 @@ from gacrl.config import files as configuration
 from gacrl.config.checks import whole
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
-from gacrl.errors import UserError
+from gacrl.errors import Faulty, UserError
 from gacrl.evaluation import episodes, references
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
@@ -30,11 +30,11 @@ from gacrl.training.build import (
     stacked_shapes,
 )
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
-from gacrl.training.divergence import Diverged, Faulty
+from gacrl.training.divergence import Diverged
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
 from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
-from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.trainer import AbstractTrainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
@@ -82,7 +82,7 @@ def start(
         return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
 
 
-def begin_with(trainer: Trainer, config: RunConfig, parent: Parent) -> TrainState:
+def begin_with(trainer: AbstractTrainer, config: RunConfig, parent: Parent) -> TrainState:
     """A fresh training state, stacked, with what the parent has learned."""
     state, algorithm = trainer.init_stacked(config.seeds), trainer.algorithm
     like = jax.tree.map(
@@ -159,7 +159,7 @@ def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpo
     return found
 
 
-def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
+def restore(trainer: AbstractTrainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
     """The training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
@@ -171,7 +171,7 @@ def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | 
 def _run(
     folder: RunFolder,
     config: RunConfig,
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
@@ -240,7 +240,7 @@ def _clock(found: checkpoint.Checkpoint) -> Clock:
 
 
 def _finish(
-    folder: RunFolder, config: RunConfig, trainer: Trainer, state: TrainState, env_steps: int, clock: Clock
+    folder: RunFolder, config: RunConfig, trainer: AbstractTrainer, state: TrainState, env_steps: int, clock: Clock
 ) -> dict[str, Any]:
     """The closing evaluation, some episodes to look at, and last the summary, which makes the run a finished one."""
     begun, num_episodes = time.perf_counter(), config.evaluation.final_episodes
@@ -282,7 +282,7 @@ def _finish(
     return summary
 
 
-def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learner) -> None:
+def _show(folder: RunFolder, config: RunConfig, trainer: AbstractTrainer, learner: Learner) -> None:
     """Some episodes of the first seed to look at, and as a GIF where there is something to see."""
     task = tasks.find(config.task)
     shown = episodes.record_many(
@@ -299,12 +299,12 @@ def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learn
         folder.episodes.mkdir(exist_ok=True)
         for number, episode in enumerate(shown):
             episode.save(folder.episodes / f"{number}.npz")
-        if shown and shown[0].scene is not None:
+        if shown and shown[0].visible:
             title = f"{label(config)}, seed {config.seed}"
             render.gif(shown, folder.gif, title=title, words=task.words)
 
 
-def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
+def load_learners(found: checkpoint.Checkpoint, trainer: AbstractTrainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = trainer.algorithm.acting(learner_shapes(trainer))
     learners = checkpoint.load(found, shapes, prefix=".learner")

@@ -1,0 +1,76 @@
+"""Agents acting in environments that live in Python: a compiled program decides, the host steps.
+
+The step is `rollout.act`, cut in two where the environment moves. Memory is renewed at the start of the next decision,
+in the same program: a call of a program costs more than what it computes here.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from gacrl import rollout
+from gacrl.envs.environment import TimeStep
+from gacrl.envs.hosted import Hosted, shaped
+from gacrl.rollout import Carry
+from gacrl.types import Decision, Intervention, Memory, Policy, PRNGKey
+
+Left: TypeAlias = Any
+"""Whose life ended with the step before, inside an episode: [E, N]."""
+Decide: TypeAlias = Callable[[Carry, Left, PRNGKey, Any], tuple[Carry, Decision]]
+"""(carry, left, key, step) -> where agents stand after deciding, and what they do."""
+
+
+def decider(policy: Policy, initial_memory: Memory, intervention: Intervention | None = None) -> Decide:
+    """Return the device's half of a step of E environments; jit it."""
+
+    def decide(carry: Carry, left: Left, key: PRNGKey, step: Int[Array, ""]) -> tuple[Carry, Decision]:
+        keys = jax.random.split(jax.random.fold_in(key, step), (carry.first.shape[0], 3))
+        return rollout.decide(policy, rollout.forgetting(initial_memory, carry, left), keys, intervention)
+
+    return decide
+
+
+def seeds_from(key: PRNGKey, count: int) -> list[int]:
+    """Draw so many seeds of episodes; of more, the first are the same."""
+    draws = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+    return draws.integers(2**31, size=count).tolist()
+
+
+class Stage:
+    """Copies of an environment with agents in them, and what is seen there now. Arrays have the axes `lead` in front."""
+
+    def __init__(self, env: Hosted, *lead: int, seen: bool = False):
+        """seen: pictures of the copies will be asked for."""
+        self._lead, self._count = lead, int(np.prod(lead))
+        self.copies = env.open(self._count, seen)
+        self._nobody = np.zeros((*lead, env.num_agents), bool)
+
+    def begin(self, seeds: Sequence[int]) -> None:
+        """Begin an episode in every copy, each with its seed."""
+        seen = self.copies.begin(range(self._count), seeds)
+        self.seen, self.left = shaped(seen, *self._lead), self._nobody
+        self.first = np.ones(self._lead, bool)
+
+    def carry(self, carry: Carry) -> Carry:
+        """Put what is seen now in its place."""
+        return carry._replace(observation=self.seen, first=self.first)
+
+    def step(
+        self, decision: Decision, again: bool = True, going: Bool[np.ndarray, "..."] | None = None
+    ) -> TimeStep:
+        """Let every copy take the step that was decided; returns what it brought.
+
+        again: begin a new episode where one has ended. going: the copies that are still of interest.
+        """
+        actions = np.asarray(decision.action).reshape(self._count, -1)
+        after = self.copies.step(actions, None if going is None else going.reshape(-1))
+        over = after.terminated | after.truncated
+        seen = after.observation
+        if again and over.any():
+            seen = self.copies.begin(np.flatnonzero(over).tolist())
+        assert after.left is not None
+        self.seen, self.left, self.first = shaped((seen, after.left, over), *self._lead)
+        return shaped(after, *self._lead)
