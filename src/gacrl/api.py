@@ -15,10 +15,10 @@ from gacrl.config.checks import require_kind, whole
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment, typed_keys
+from gacrl.errors import ConfigError
 from gacrl.evaluation import evaluate as playing
 from gacrl.evaluation.summary import Estimate, estimated
 from gacrl.experiments import scoring
-from gacrl.errors import ConfigError
 from gacrl.messages import interventions
 from gacrl.tasks import own
 from gacrl.training import build, loop, session

@@ -20,14 +20,20 @@ from gacrl.types import Decision, Intervention, Memory, Policy, PRNGKey
 Left: TypeAlias = Any
 """Whose life ended with the step before, inside an episode: [E, N]."""
 Decide: TypeAlias = Callable[[Carry, Left, PRNGKey, Any], tuple[Carry, Decision]]
-"""(carry, left, key, step) -> where agents stand after deciding, and what they do."""
+"""(carry, left, key of all steps, step) -> where agents stand after deciding, and what they do."""
 
 
-def decider(policy: Policy, initial_memory: Memory, intervention: Intervention | None = None) -> Decide:
-    """Return the device's half of a step of E environments; jit it."""
+def decider(
+    policy: Policy, initial_memory: Memory, num_steps: int, intervention: Intervention | None = None
+) -> Decide:
+    """Return the device's half of a step of E environments, one of so many steps; jit it.
+
+    It draws what a compiled rollout of so many steps draws.
+    """
 
     def decide(carry: Carry, left: Left, key: PRNGKey, step: Int[Array, ""]) -> tuple[Carry, Decision]:
-        keys = jax.random.split(jax.random.fold_in(key, step), (carry.first.shape[0], 3))
+        key = key if num_steps == 1 else jax.random.split(key, num_steps)[step]
+        keys = jax.random.split(key, (carry.first.shape[0], 3))
         return rollout.decide(policy, rollout.forgetting(initial_memory, carry, left), keys, intervention)
 
     return decide
@@ -40,7 +46,7 @@ def seeds_from(key: PRNGKey, count: int) -> list[int]:
 
 
 class Stage:
-    """Copies of an environment with agents in them, and what is seen there now. Arrays have the axes `lead` in front."""
+    """Copies of an environment with agents in them, and what is seen there now: arrays with `lead` in front."""
 
     def __init__(self, env: Hosted, *lead: int, seen: bool = False):
         """seen: pictures of the copies will be asked for."""

@@ -225,7 +225,7 @@ def record_many(
     lives in Python draws its own pictures.
     """
     if isinstance(env, Hosted):
-        return _record_on_host(env, on_host.actors(policy, initial_memory, intervention), key, num_episodes)
+        return _record_on_host(env, on_host.actors(env, policy, initial_memory, intervention), key, num_episodes)
 
     @jax.jit
     def play(memory: Memory, params: EnvParams, key: PRNGKey) -> _Played:
@@ -279,7 +279,10 @@ def _record_on_host(env: Hosted, playing: on_host.Actors, key: PRNGKey, num_epis
             frames.append(copies.pictures(width))
 
         moments = list(on_host.play(env, playing, key, episodes, look))
-        steps = [rollout.happened(moment.decided, moment.decision, moment.after) for moment in moments]
+        steps = [
+            rollout.happened(moment.decided, moment.decision._replace(extras=()), moment.after)
+            for moment in moments
+        ]
         stacked = jax.tree.map(lambda *rows: np.stack(rows), *steps)
         played = _played(stacked, stacked.terminated | stacked.truncated)
         for k in range(len(episodes)):

@@ -45,7 +45,7 @@ def evaluate(
     the same key gives every policy the same starts. An environment that lives in Python is played by the host.
     """
     if isinstance(env, Hosted):
-        playing = on_host.actors(policy, initial_memory, intervention)
+        playing = on_host.actors(env, policy, initial_memory, intervention)
         return on_host.evaluate(env, playing, key, num_episodes, metrics)  # pyright: ignore[reportReturnType]
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes, intervention, policy)

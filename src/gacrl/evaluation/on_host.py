@@ -37,9 +37,9 @@ class Actors(NamedTuple):
     """Of all three, compiled."""
 
 
-def actors(policy: Policy, memory: Memory, intervention: Intervention | None) -> Actors:
+def actors(env: Hosted, policy: Policy, memory: Memory, intervention: Intervention | None) -> Actors:
     """Compile a policy; its numbers become constants of the program."""
-    return Actors(policy, memory, intervention, jax.jit(decider(policy, memory, intervention)))
+    return Actors(policy, memory, intervention, jax.jit(decider(policy, memory, env.max_cycles, intervention)))
 
 
 class Moment(NamedTuple):
@@ -93,7 +93,7 @@ def play(
     and after every step.
     """
     start_key, act_key = jax.random.split(key)
-    batch_key = jax.random.fold_in(act_key, episodes.start)
+    batch_key = jax.random.fold_in(act_key, episodes.start) if episodes.start else act_key
     carry = rollout.start(env, (), playing.memory, start_key, len(episodes), playing.intervention, playing.policy)
     stage = Stage(env, len(episodes), seen=look is not None)
     look = (lambda copies: None) if look is None else look

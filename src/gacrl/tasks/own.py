@@ -39,8 +39,8 @@ class NoSettings:
 def bring(env: Any) -> tuple[str, Any]:
     """Have a task at hand; returns its name, and the settings that stand where none are said.
 
-    env: the name of a task, `FILE.py:NAME`, `pettingzoo:MODULE`, a `Task`, a subclass of `Environment` or an instance of one. Raises
-    ConfigError, with one sentence, for what is none of these, or for a task that does not keep its word.
+    env: the name of a task, `FILE.py:NAME`, `pettingzoo:MODULE`, a `Task`, a subclass of `Environment` or an instance
+    of one. Raises ConfigError, with one sentence, for what is none of these, or for a task that does not keep its word.
     """
     if isinstance(env, str):
         name = _by_name(env)

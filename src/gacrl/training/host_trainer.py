@@ -116,7 +116,7 @@ class HostTrainer(AbstractTrainer):
         learner, carry, left, key = seen
         rollout_key, _, _ = jax.random.split(key, 3)
         policy = self.algorithm.policy(learner, True)
-        return decider(policy, self.memory, self.intervention)(carry, left, rollout_key, step)
+        return decider(policy, self.memory, self.num_steps, self.intervention)(carry, left, rollout_key, step)
 
     def _learn_of_one(self, given: tuple[Running, Played]) -> Running:
         running, played = given
@@ -161,6 +161,7 @@ class HostTrainer(AbstractTrainer):
         """The device's half of a step of an evaluation, with the learner as data: it compiles once."""
 
         def decide(learner: Learner, *seen: Any) -> tuple[Carry, Decision]:
-            return decider(self.algorithm.policy(learner, explore), self.memory, self.intervention)(*seen)
+            policy, steps = self.algorithm.policy(learner, explore), self.evaluation_env.max_cycles
+            return decider(policy, self.memory, steps, self.intervention)(*seen)
 
         return jax.jit(decide)

@@ -62,7 +62,7 @@ class Layout:
 
 
 def lay_out(task: str, agents: Sequence[str], seen: Mapping[str, Any], does: Mapping[str, Any]) -> Layout:
-    """Read Gymnasium's spaces of what agents see and do. Raises ConfigError, naming the agent, for one that fits not."""
+    """Read Gymnasium's spaces of what agents see and do. Raises ConfigError for one that does not fit."""
     shapes = [_shape(task, agent, seen[agent]) for agent in agents]
     parts = [_parts(task, agent, does[agent]) for agent in agents]
     kinds = [
