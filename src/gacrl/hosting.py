@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Int
 
 from gacrl import rollout
 from gacrl.envs.environment import TimeStep
-from gacrl.envs.hosted import Hosted, shaped
+from gacrl.envs.hosted import Hosted
 from gacrl.rollout import Carry
 from gacrl.types import Decision, Intervention, Memory, Policy, PRNGKey
 
@@ -46,37 +46,32 @@ def seeds_from(key: PRNGKey, count: int) -> list[int]:
 
 
 class Stage:
-    """Copies of an environment with agents in them, and what is seen there now: arrays with `lead` in front."""
+    """E copies of an environment with agents in them, and what is seen there now."""
 
-    def __init__(self, env: Hosted, *lead: int, seen: bool = False):
+    def __init__(self, env: Hosted, copies: int, seen: bool = False):
         """seen: pictures of the copies will be asked for."""
-        self._lead, self._count = lead, int(np.prod(lead))
-        self.copies = env.open(self._count, seen)
-        self._nobody = np.zeros((*lead, env.num_agents), bool)
+        self._count, self.copies = copies, env.open(copies, seen)
+        self._nobody = np.zeros((copies, env.num_agents), bool)
 
     def begin(self, seeds: Sequence[int]) -> None:
         """Begin an episode in every copy, each with its seed."""
-        seen = self.copies.begin(range(self._count), seeds)
-        self.seen, self.left = shaped(seen, *self._lead), self._nobody
-        self.first = np.ones(self._lead, bool)
+        self.seen, self.left = self.copies.begin(range(self._count), seeds), self._nobody
+        self.first = np.ones(self._count, bool)
 
     def carry(self, carry: Carry) -> Carry:
         """Put what is seen now in its place."""
         return carry._replace(observation=self.seen, first=self.first)
 
     def step(
-        self, decision: Decision, again: bool = True, going: Bool[np.ndarray, "..."] | None = None
+        self, decision: Decision, again: bool = True, going: Bool[np.ndarray, " E"] | None = None
     ) -> TimeStep:
         """Let every copy take the step that was decided; returns what it brought.
 
         again: begin a new episode where one has ended. going: the copies that are still of interest.
         """
-        actions = np.asarray(decision.action).reshape(self._count, -1)
-        after = self.copies.step(actions, None if going is None else going.reshape(-1))
-        over = after.terminated | after.truncated
-        seen = after.observation
+        after = self.copies.step(np.asarray(decision.action), going)
+        over = np.asarray(after.terminated | after.truncated)
+        self.seen, self.left, self.first = after.observation, after.left, over
         if again and over.any():
-            seen = self.copies.begin(np.flatnonzero(over).tolist())
-        assert after.left is not None
-        self.seen, self.left, self.first = shaped((seen, after.left, over), *self._lead)
-        return shaped(after, *self._lead)
+            self.seen = self.copies.begin(np.flatnonzero(over).tolist())
+        return after

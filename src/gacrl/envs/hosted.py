@@ -2,9 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt8
@@ -66,8 +65,3 @@ class Hosted(Environment):
         nobody, never = jnp.zeros(self.num_agents, bool), jnp.zeros((), bool)
         seen = self.reset(key, params)[1]
         return (), TimeStep(seen, jnp.zeros(self.num_agents), never, never, left=nobody)
-
-
-def shaped(tree: Any, *lead: int) -> Any:
-    """Give arrays [C, …] the axes `lead` in place of their first one; None stays."""
-    return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), tree)

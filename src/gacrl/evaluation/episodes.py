@@ -279,17 +279,20 @@ def _record_on_host(env: Hosted, playing: on_host.Actors, key: PRNGKey, num_epis
             frames.append(copies.pictures(width))
 
         moments = list(on_host.play(env, playing, key, episodes, look))
-        steps = [
-            rollout.happened(moment.decided, moment.decision._replace(extras=()), moment.after)
-            for moment in moments
-        ]
-        stacked = jax.tree.map(lambda *rows: np.stack(rows), *steps)
-        played = _played(stacked, stacked.terminated | stacked.truncated)
+        steps = rollout.happened(
+            *_stacked([(moment.decided, moment.decision, moment.after) for moment in moments])
+        )
+        played = jax.device_get(_played(steps, steps.terminated | steps.truncated))
         for k in range(len(episodes)):
             episode = _episode(played, k)
             shown = [moment[k] for moment in frames[: episode.num_steps + 1] if moment is not None]
             recorded.append(replace(episode, frames=np.stack(shown) if shown else None))
     return recorded[:num_episodes]
+
+
+@jax.jit
+def _stacked(steps: list[Any]) -> Any:
+    return jax.tree.map(lambda *rows: jnp.stack(rows), *steps)
 
 
 def seen_of(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:

@@ -46,7 +46,7 @@ def evaluate(
     """
     if isinstance(env, Hosted):
         playing = on_host.actors(env, policy, initial_memory, intervention)
-        return on_host.evaluate(env, playing, key, num_episodes, metrics)  # pyright: ignore[reportReturnType]
+        return jax.tree.map(jnp.asarray, on_host.evaluate(env, playing, key, num_episodes, metrics))
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes, intervention, policy)
     first_step = jax.eval_shape(

@@ -95,7 +95,7 @@ def play(
     start_key, act_key = jax.random.split(key)
     batch_key = jax.random.fold_in(act_key, episodes.start) if episodes.start else act_key
     carry = rollout.start(env, (), playing.memory, start_key, len(episodes), playing.intervention, playing.policy)
-    stage = Stage(env, len(episodes), seen=look is not None)
+    stage = Stage(env, len(episodes), look is not None)
     look = (lambda copies: None) if look is None else look
     with contextlib.closing(stage.copies):
         stage.begin(seeds_from(start_key, episodes.stop)[episodes.start :])

@@ -239,9 +239,9 @@ class AbstractTrainer(ABC):
             tally, episodes = jax.lax.scan(one_step, tally, inputs)
         return tally, sum_up(episodes, inputs[1])
 
-    def none_yet(self, state: TrainState, shapes: Update) -> Running:
-        """A chunk before its first update, of this shape."""
-        _, _, *shapes = shapes
+    def none_yet(self, state: TrainState, update: Any) -> Running:
+        """A chunk before its first update, given the shapes of an `Update`."""
+        _, _, *shapes = update
         zeros, unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return Running(state, no_episodes(self.table), zeros, state.env_params, unseen)
 
