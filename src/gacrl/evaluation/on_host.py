@@ -6,7 +6,7 @@ Episodes are played some at a time: an intervention that takes words of other ep
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from gacrl import rollout
 from gacrl.envs.environment import TimeStep
 from gacrl.envs.hosted import Copies, Hosted
-from gacrl.evaluation.metrics import Table, count_step_if, episode_metrics, measures_of, no_steps, table_of
+from gacrl.evaluation.metrics import Table, Tally, count_step_if, episode_metrics, measures_of, no_steps, table_of
 from gacrl.hosting import Decide, Stage, decider, seeds_from
 from gacrl.rollout import Carry, measured
 from gacrl.tasks.task import Metric
@@ -68,10 +68,10 @@ def evaluate(
     return dict(zip(table.names, values.T, strict=True))
 
 
-def _counting(table: Table) -> tuple[Callable[..., object], Callable[..., object]]:
+def _counting(table: Table) -> tuple[Callable[..., Tally], Callable[[Tally], Any]]:
     """Programs that count a step of E episodes, and close their tallies."""
 
-    def count(going: object, tally: object, after: TimeStep) -> object:
+    def count(going: Any, tally: Tally, after: TimeStep) -> Tally:
         return jax.vmap(count_step_if)(going, tally, measured(after))
 
     return jax.jit(count), jax.jit(jax.vmap(partial(episode_metrics, table=table)))

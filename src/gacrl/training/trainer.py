@@ -196,10 +196,8 @@ class AbstractTrainer(ABC):
         """Compile what a chunk needs, and return the chunk. The state stays as it is."""
 
     @abstractmethod
-    def evaluate(
-        self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
-    ) -> dict[str, Float[Array, "S K"]]:
-        """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""
+    def evaluate(self, learners: Learner, explore: bool, stream: Stream, num_episodes: int) -> dict[str, Any]:
+        """The metrics of K fixed episodes of each seed's learner, [S, K], in the evaluation's task."""
 
     def learn(
         self,
@@ -306,7 +304,7 @@ class Trainer(AbstractTrainer):
         return closed(running, num_updates)
 
     @partial(jax.jit, static_argnums=(0, 2, 3, 4))
-    def evaluate(
+    def evaluate(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[Array, "S K"]]:
         """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""
