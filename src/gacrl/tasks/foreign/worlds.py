@@ -1,6 +1,7 @@
 """Episodes of PettingZoo's parallel environments, as arrays of a team; whatever they must not hand out is named."""
 
 import contextlib
+import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any
 
@@ -50,9 +51,11 @@ class World:
 
     def step(self, choices: Int[np.ndarray, " N"]) -> None:
         """Take a step. Raises Faulty."""
-        layout, before = self.layout, self.there
-        acting = [(i, agent) for i, agent in enumerate(layout.agents) if before[i]]
-        actions = {agent: layout.action(i, int(choices[i])) for i, agent in acting}
+        acting = [(i, agent) for i, agent in enumerate(self.layout.agents) if self.there[i]]
+        actions = {
+            agent: self.layout.action(i, choice)
+            for (i, agent), choice in zip(acting, choices[self.there].tolist(), strict=True)
+        }
         known = set(self.env.agents)
         with self._blamed("step"):
             for agent in known & self.scripted.keys():
@@ -62,20 +65,29 @@ class World:
         agents = set(self.env.agents)
         self._require_no_newcomer(agents - known)
         self.reward[:] = 0.0
-        ended, cut = np.zeros_like(before), np.zeros_like(before)
+        self.left[:] = False
+        ended, cut = list[int](), list[int]()
         for i, agent in acting:
             self.reward[i] = self._number(agent, rewards)
-            ended[i], cut[i] = self._flag(agent, terminated), self._flag(agent, truncated)
-            if agent not in agents and not (ended[i] or cut[i]):
+            if self._flag(agent, terminated):
+                ended.append(i)
+            elif self._flag(agent, truncated):
+                cut.append(i)
+            elif agent not in agents:
                 raise Faulty(self._told(agent, "is gone, and was neither terminated nor truncated"))
-        self.raw = float(self.reward[before].mean())
-        going = before & ~(ended | cut)
-        over = not going.any() or self.clock >= self.max_cycles
-        self.terminated = bool(over and ended[before].all())
-        self.truncated = over and not self.terminated
-        self.left = (ended | cut) if not over else (ended & (not self.terminated))
-        self.there = before if over else going
+        self.raw = float(self.reward.sum()) / len(acting)
+        self._end(ended, cut, len(acting))
         self._see(seen, infos, self.there)
+
+    def _end(self, ended: list[int], cut: list[int], acting: int) -> None:
+        """End the lives of these agents, who were terminated or truncated; with the last of them ends the episode."""
+        over = len(ended) + len(cut) == acting or self.clock >= self.max_cycles
+        self.terminated = over and len(ended) == acting
+        self.truncated = over and not self.terminated
+        if not self.terminated:
+            self.left[ended if over else ended + cut] = True
+        if not over and (ended or cut):
+            self.there = self.there & ~self.left
 
     def _see(self, seen: Mapping[str, Any], infos: Mapping[str, Any], there: Bool[np.ndarray, " N"]) -> None:
         """Lay out what agents see; those that are gone see zeros."""
@@ -94,14 +106,17 @@ class World:
                 )
             self.features[i, : self.layout.sizes[i]] = row if len(shape) == 1 else np.ravel(row)
             self._allow(i, agent, infos)
-        if not np.isfinite(self.features).all():
-            bad = np.flatnonzero(~np.isfinite(self.features).all(1))[0]
-            raise Faulty(self._told(self.layout.agents[bad], "saw a number that is not finite"))
+
+    def require_finite(self) -> None:
+        """Raises Faulty where an agent sees a number that is not finite."""
+        bad = np.flatnonzero(~np.isfinite(self.features).all(1))
+        if bad.size:
+            raise Faulty(self._told(self.layout.agents[bad[0]], "saw a number that is not finite"))
 
     def _allow(self, i: int, agent: str, infos: Mapping[str, Any]) -> None:
         """Take the action mask of an agent's info, where there is one."""
-        info = infos.get(agent) or {}
-        if "action_mask" not in info:
+        info = infos.get(agent)
+        if not info or "action_mask" not in info:
             return
         allowed, count = np.ravel(info["action_mask"]).astype(bool), int(self.layout.mask[i].sum())
         if allowed.size != count or not allowed.any():
@@ -115,7 +130,7 @@ class World:
             reward = float(rewards[agent])
         except (TypeError, ValueError):
             raise Faulty(self._told(agent, f"got the reward {rewards[agent]!r}, which is no number")) from None
-        if not np.isfinite(reward):
+        if not math.isfinite(reward):
             raise Faulty(self._told(agent, f"got a reward that is not finite, {reward}"))
         return reward
 
@@ -176,8 +191,12 @@ class Worlds(Copies):
         )
 
     def _observation(self) -> Observation:
+        features = self._all("features")
+        if not np.isfinite(features).all():
+            for world in self._worlds:
+                world.require_finite()
         return Observation(
-            features=self._all("features"),
+            features=features,
             positions=None,
             agent_mask=self._all("there"),
             landmark_mask=None,
