@@ -43,7 +43,7 @@ usage: gacrl COMMAND [OPTIONS]
   ablate     every part of GACRL off in turn: what each is worth
   talk       does a task need talk, and do the agents use it
   sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
-  tasks      what can be trained on; a task of your own is --env FILE.py:NAME
+  tasks      what can be trained on; of your own: --env FILE.py:NAME or pettingzoo:MODULE
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
