@@ -101,7 +101,7 @@ def _parts(task: str, agent: str, space: Any) -> tuple[tuple[int, ...], tuple[in
     """Sizes and first numbers of the parts of an action, and whether it is a single number."""
     kind = type(space).__name__
     if kind == "Discrete":
-        return (int(space.n),), (int(space.start),), True
+        return (int(space.n),), (int(getattr(space, "start", 0)),), True
     if kind not in ("MultiDiscrete", "MultiBinary"):
         raise ConfigError(
             f"{agent} of {task} acts by a {kind}: gacrl's agents choose among actions (Discrete, MultiDiscrete, "

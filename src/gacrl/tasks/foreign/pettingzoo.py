@@ -1,11 +1,10 @@
 """PettingZoo's parallel environments as tasks: by a function that makes one, or by the module that has one."""
 
 import inspect
-import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, fields
 from functools import cache
-from importlib import import_module, metadata
+from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
@@ -17,13 +16,13 @@ from gacrl.envs.environment import EnvParams, EnvState, TimeStep, as_floats, obs
 from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
+from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
 from gacrl.tasks.foreign.layout import Layout, lay_out
 from gacrl.tasks.foreign.worlds import Scripted, World, Worlds
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
 
 SCHEME = "pettingzoo:"
-_PLAIN = (bool, int, float, str, bool | None, int | None, float | None, str | None)
 _NOBODY: Scripted = MappingProxyType({})
 
 
@@ -69,16 +68,7 @@ def by_module(name: str) -> Own:
         raise ConfigError(f"--env {name}: {_turn_based('the module') if turns else 'it has no `parallel_env`'}")
     signature = inspect.signature(getattr(module, "raw_env", make_env))  # parallel_env itself takes **kwargs
     task = _task(name, _Maker(make_env, signature), {})
-    return Own(task, task.settings(), digest=_version(module_name))
-
-
-def _version(module: str) -> str | None:
-    """What tells one version of an environment from another."""
-    package = module.partition(".")[0]
-    try:
-        return f"{package} {metadata.version(package)}"
-    except metadata.PackageNotFoundError:
-        return None
+    return Own(task, task.settings(), digest=version_of(module_name))
 
 
 def _turn_based(what: str) -> str:
@@ -98,15 +88,11 @@ class _Maker:
 
     def settings(self) -> type:
         """A frozen dataclass of the arguments that are numbers and names, and of `max_cycles`."""
-        known = {
-            parameter.name: (_kind(parameter), parameter.default)
-            for parameter in self.signature.parameters.values()
-            if parameter.name != "render_mode" and _kind(parameter) is not None
-        }
+        known = plain_arguments(self.signature)
+        known.pop("render_mode", None)
         if self.max_cycles is not None or "max_cycles" not in known:
             known["max_cycles"] = (int | None, self.max_cycles)
-        rows = [(name, kind, field(default=default)) for name, (kind, default) in known.items()]
-        return make_dataclass("ZooSettings", rows, frozen=True)
+        return as_settings("ZooSettings", known)
 
     def takes(self, name: str) -> bool:
         """Whether it has that argument."""
@@ -133,21 +119,6 @@ class _Maker:
         told = getattr(env, "metadata", None)
         name = told.get("name") if isinstance(told, Mapping) else None
         return name if isinstance(name, str) else getattr(self.make_env, "__name__", "zoo")
-
-
-def _kind(parameter: inspect.Parameter) -> Any:
-    """The type of an argument that can be a setting; None of any other."""
-    if parameter.default is inspect.Parameter.empty:
-        return None
-    hint = parameter.annotation
-    if isinstance(hint, str):
-        try:
-            hint = typing.get_type_hints(type("_", (), {"__annotations__": {"_": hint}}))["_"]
-        except (NameError, TypeError, SyntaxError):
-            hint = None
-    if hint in _PLAIN:
-        return hint
-    return type(parameter.default) if type(parameter.default) in _PLAIN else None
 
 
 def _task(name: str, maker: _Maker, scripted: Scripted) -> Task:
