@@ -24,9 +24,9 @@ SETTINGS_OF_TASKS = tuple(f"{task}.settings" for task in TASKS)
 LAYERS = (
     ("errors", "extras", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
     ("cli.arguments", "cli.tables", "envs", "messages.interventions", "networks", "report", "scene"),
-    ("tasks.own", *TASKS),
+    ("tasks.own", "tasks.foreign", *TASKS),
     ("algorithms",),
-    ("rollout",),
+    ("rollout", "hosting"),
     ("evaluation",),
     ("adapters", "messages", "render"),
     ("film",),

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gacrl.adapters.pettingzoo import to_pettingzoo
     from gacrl.algorithms.contract import Algorithm
     from gacrl.api import Run, Trainer, evaluate, iterate, make_env, train, trainer
     from gacrl.config.files import preset
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from gacrl.evaluation.summary import Estimate
     from gacrl.messages.interventions import delay, drop, noise, scramble, silence, swap
     from gacrl.play import LoadedPolicy, load_policy
+    from gacrl.tasks.foreign.pettingzoo import from_pettingzoo
     from gacrl.tasks.task import Metric, Task
     from gacrl.training.watching import Watcher
     from gacrl.types import Arrives, Intervention
@@ -44,6 +46,7 @@ _HOMES = {
     "delay": "gacrl.messages.interventions",
     "drop": "gacrl.messages.interventions",
     "evaluate": "gacrl.api",
+    "from_pettingzoo": "gacrl.tasks.foreign.pettingzoo",
     "iterate": "gacrl.api",
     "load_policy": "gacrl.play",
     "make_env": "gacrl.api",
@@ -53,6 +56,7 @@ _HOMES = {
     "scramble": "gacrl.messages.interventions",
     "silence": "gacrl.messages.interventions",
     "swap": "gacrl.messages.interventions",
+    "to_pettingzoo": "gacrl.adapters.pettingzoo",
     "train": "gacrl.api",
     "trainer": "gacrl.api",
 }
@@ -76,6 +80,7 @@ __all__ = [  # the keys of _HOMES, spelled out for type checkers
     "delay",
     "drop",
     "evaluate",
+    "from_pettingzoo",
     "iterate",
     "load_policy",
     "make_env",
@@ -85,6 +90,7 @@ __all__ = [  # the keys of _HOMES, spelled out for type checkers
     "scramble",
     "silence",
     "swap",
+    "to_pettingzoo",
     "train",
     "trainer",
 ]

@@ -15,6 +15,7 @@ from gacrl.config.checks import require_kind, whole
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment, typed_keys
+from gacrl.errors import ConfigError
 from gacrl.evaluation import evaluate as playing
 from gacrl.evaluation.summary import Estimate, estimated
 from gacrl.experiments import scoring
@@ -27,6 +28,7 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.telling import teller
 from gacrl.training.trackers.following import tracked
 from gacrl.training.trainer import ChunkReport, TrainState
+from gacrl.training.trainer import Trainer as CompiledTrainer
 from gacrl.training.watching import Watcher
 from gacrl.types import Arrives, Intervention, PRNGKey
 
@@ -170,6 +172,10 @@ def trainer(
     """
     config = replace(settled(config, None, env), num_seeds=1)
     built = build.make_trainer(config)
+    if not isinstance(built, CompiledTrainer):
+        raise ConfigError(
+            f"{config.task} lives in Python, and cannot be compiled: take gacrl.iterate or gacrl.train"
+        )
     count = config.evaluation.num_episodes if episodes is None else whole(episodes, "episodes", 1)
 
     def evaluate(state: TrainState, key: PRNGKey) -> dict[str, Float[Array, " K"]]:

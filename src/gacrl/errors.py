@@ -25,3 +25,7 @@ def full_memory(error: BaseException) -> str | None:
 
 class ConfigError(UserError, ValueError):
     """A setting that cannot be: one sentence that names the thing and the mend."""
+
+
+class Faulty(UserError):
+    """A task has given what it must not: a number that is not finite, another shape, an error of its own."""

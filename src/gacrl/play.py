@@ -25,7 +25,7 @@ from gacrl.training.devices import one_seed, rows
 from gacrl.training.keeper import Acting
 from gacrl.training.recorder import RunFolder
 from gacrl.training.session import Parent
-from gacrl.training.trainer import Trainer
+from gacrl.training.trainer import AbstractTrainer
 from gacrl.types import Intervention, Memory, Policy
 
 
@@ -36,7 +36,7 @@ class TrainedRun:
     name: str
     config: RunConfig
     """As trained, except for the changes of the task that were asked for."""
-    trainer: Trainer
+    trainer: AbstractTrainer
     learners: Any
     """What acts, stacked over the seeds."""
     env_steps: int

@@ -90,7 +90,7 @@ def drawn(
     number = 0
     for k, episode in enumerate(episodes, 1):
         note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
-        picture = _Picture(episode, size, title, note, words)
+        picture = _Photos(episode, size) if episode.scene is None else _Picture(episode, size, title, note, words)
         for t in _moments(episode.num_steps):
             if number % step == 0:
                 yield picture.draw(t)
@@ -215,6 +215,20 @@ def _view(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
 
 def _has_ground(scene: Scene) -> bool:
     return bool((scene.ground[0, 1] > scene.ground[0, 0]).all())
+
+
+class _Photos:
+    """An episode as its environment drew it."""
+
+    def __init__(self, episode: Episode, size: int) -> None:
+        if episode.frames is None:
+            raise ValueError("the episode has no scene: there is nothing to draw")
+        self._frames = episode.frames
+        self._size = size, round(size * self._frames.shape[1] / self._frames.shape[2])
+
+    def draw(self, t: int) -> Image.Image:
+        """The frame before step t."""
+        return Image.fromarray(self._frames[t]).resize(self._size)
 
 
 class _Picture:

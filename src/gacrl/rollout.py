@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
+from gacrl.config.checks import require
 from gacrl.envs import copies
 from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep, typed_keys
 from gacrl.errors import ConfigError
@@ -80,6 +81,23 @@ def spoken(decision: Decision) -> Words:
     return decision.messages
 
 
+def decide(
+    policy: Policy, carry: Carry, keys: Key[Array, "E 3"], intervention: Intervention | None = None
+) -> tuple[Carry, Decision]:
+    """Let the agents of every environment decide: where they stand then, what they heard included, and what they do.
+
+    No environment moves.
+    """
+    observation, carried = carry.observation, carry.intervention
+    if intervention is not None:
+        ask, key = partial(say, policy, carry, keys[:, 0]), jax.random.fold_in(keys[0, 2], 1)
+        observation = observation._replace(arrives=intervention.arrives(carried, ask, carry.first, key))
+    decision, memory = jax.vmap(policy)(carry.memory, observation, keys[:, 0])
+    if intervention is not None:
+        carried = intervention.follow(carried, spoken(decision), carry.first)
+    return carry._replace(observation=observation, memory=memory, intervention=carried), decision
+
+
 def act(
     env: Environment,
     policy: Policy,
@@ -88,29 +106,34 @@ def act(
     keys: Key[Array, "E 3"],
     intervention: Intervention | None = None,
 ) -> tuple[Carry, Transition]:
-    """Let every environment take one step, and reset none: where they stand then, and what happened."""
-    observation, carried = carry.observation, carry.intervention
-    if intervention is not None:
-        ask, key = partial(say, policy, carry, keys[:, 0]), jax.random.fold_in(keys[0, 2], 1)
-        observation = observation._replace(arrives=intervention.arrives(carried, ask, carry.first, key))
-    decision, memory = jax.vmap(policy)(carry.memory, observation, keys[:, 0])
+    """Let every environment take one step, and reset none: where they stand then, and what happened.
+
+    Raises ConfigError for an environment that lives in Python.
+    """
+    require(not env.hosted, f"{type(env).__name__} lives in Python: no compiled program can step it")
+    decided, decision = decide(policy, carry, keys, intervention)
     step_mapped = jax.vmap(env.step, (0, 0, 0, None))  # and not `step_many`: docs/design.md
     env_state, after = step_mapped(carry.env_state, decision.action, keys[:, 1], params)
-    if intervention is not None:
-        carried = intervention.follow(carried, spoken(decision), carry.first)
-    transition = Transition(
+    over = after.terminated | after.truncated
+    return Carry(env_state, after.observation, decided.memory, over, decided.intervention), happened(
+        decided, decision, after
+    )
+
+
+def happened(decided: Carry, decision: Decision, after: TimeStep) -> Transition:
+    """Put together what a step of every environment was."""
+    observation = decided.observation
+    return Transition(
         observation=observation,
         decision=decision,
         reward=after.reward,
         terminated=after.terminated,
         truncated=after.truncated,
-        first=carry.first,
+        first=decided.first,
         next_observation=after.observation._replace(arrives=observation.arrives),
         info=measured(after),
         left=after.left,
     )
-    over = after.terminated | after.truncated
-    return Carry(env_state, after.observation, memory, over, carried), transition
 
 
 def measured(after: TimeStep) -> dict[str, Array]:
@@ -135,10 +158,15 @@ def renew(
     env_state, observation = copies.begin_anew(
         env, params, carry.env_state, carry.first, carry.observation, lambda: keys[:, 2]
     )
+    return forgetting(initial_memory, carry._replace(env_state=env_state, observation=observation), left)
+
+
+def forgetting(initial_memory: Memory, carry: Carry, left: Bool[Array, "E N"] | None) -> Carry:
+    """Give fresh memory to environments that open an episode, and to agents whose life has ended inside one."""
     memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, carry.memory, carry.first)
     if left is not None:
         memory = jax.vmap(restarted, (None, 0, 0))(initial_memory, memory, left)
-    return carry._replace(env_state=env_state, observation=observation, memory=memory)
+    return carry._replace(memory=memory)
 
 
 def step(

@@ -229,11 +229,12 @@ def small_episode(**changes) -> Episode:
         "agent_mask": rng.uniform(size=(steps, agents)) < 0.5,
         "messages": rng.uniform(size=(steps, 2, agents, 8)),
         "adjacency": rng.uniform(size=(steps, agents, agents)) < 0.5,
+        "frames": rng.integers(0, 256, (steps + 1, 4, 6, 3), np.uint8),
     }
     return Episode(**(values | changes))
 
 
-@pytest.mark.parametrize("changes", [{}, {"messages": None, "adjacency": None}, {"scene": None}])
+@pytest.mark.parametrize("changes", [{}, {"messages": None, "adjacency": None}, {"scene": None, "frames": None}])
 def test_a_saved_episode_comes_back(tmp_path, changes):
     path = tmp_path / "episode"  # no ending is added
     episode = small_episode(**changes)

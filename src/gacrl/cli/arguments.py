@@ -41,7 +41,8 @@ class Outside:
     """What does not come with the package; both are taken before anything else is understood."""
 
     env: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task: a name (`gacrl tasks`), or FILE.py:NAME, which is a Task or an Environment. That file is run."""
+    """The task: a name (`gacrl tasks`); FILE.py:NAME, a Task or an Environment, whose file is run; pettingzoo:MODULE, a
+    module with `parallel_env`; or jaxmarl:NAME."""
     use: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
     """A Python file to run first: it adds messages, exploration rules or algorithms (examples/)."""
 
@@ -108,6 +109,7 @@ class Train:
       gacrl train --preset paper --episodes 100 --algorithm.learning-rate 1e-3 --out runs/quick
       gacrl train --config my.json --seed 7           `gacrl config` prints such a file
       gacrl train --env examples/own_task.py:Beacon --env.places 7    a task of your own
+      gacrl train --env pettingzoo:mpe2.simple_spread_v3 --env.N 4    an environment of PettingZoo
       gacrl train --from runs/gacrl-1                 start with the policy of a run
       gacrl train --track tensorboard,trackio         pip install 'gacrl[track]'
     """

@@ -45,7 +45,7 @@ usage: gacrl COMMAND [OPTIONS]
   ablate     every part of GACRL off in turn: what each is worth
   talk       does a task need talk, and do the agents use it
   sweep      search settings, here or on a Ray cluster; the paper's grid, and what chance makes of it
-  tasks      what can be trained on; a task of your own is --env FILE.py:NAME
+  tasks      what can be trained on; of your own: --env FILE.py:NAME or pettingzoo:MODULE
   presets    what can be trained by name
   config     print a preset's settings as a file to change and load
   doctor     does this machine work, and do the algorithms learn what they must
@@ -384,7 +384,7 @@ def _render(words: Words) -> int:
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
     happens = _intervention(asked.messages)
     shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
-    if shown.episodes[0].scene is None:
+    if not shown.episodes[0].visible:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )

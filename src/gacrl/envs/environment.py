@@ -62,6 +62,9 @@ class Environment(ABC):
     observes_state: ClassVar[bool] = False
     """Whether `observe_many` makes observations from states, which is then cheaper than to hand them through."""
 
+    hosted: ClassVar[bool] = False
+    """It lives in Python, and no program can step it (`envs.hosted`)."""
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if inspect.isfunction(vars(cls).get("step")):

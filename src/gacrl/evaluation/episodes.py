@@ -4,17 +4,19 @@ import contextlib
 import io
 import os
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams, EnvState, typed_keys
+from gacrl.envs.hosted import Copies, Hosted
+from gacrl.evaluation import on_host
 from gacrl.scene import Discs, Scene, compose, discs
 from gacrl.types import Intervention, Memory, Observation, Policy, PRNGKey, Transition
 
@@ -43,6 +45,8 @@ class Episode:
     """What each agent sent in each round; None where the policy says nothing."""
     adjacency: Bool[np.ndarray, "T N N"] | None = None
     """Entry [t, i, j]: j's message reaches i. None where the policy uses no graph."""
+    frames: UInt8[np.ndarray, "T1 height width 3"] | None = None
+    """The environment's own pictures, where it draws them; rows as in a scene."""
 
     def __post_init__(self) -> None:
         _check(_flat(self))
@@ -51,6 +55,11 @@ class Episode:
     def num_steps(self) -> int:
         """T."""
         return self.reward.shape[0]
+
+    @property
+    def visible(self) -> bool:
+        """Whether there is something to see."""
+        return self.scene is not None or self.frames is not None
 
     @property
     def return_so_far(self) -> Float[np.ndarray, " T1"]:
@@ -82,7 +91,7 @@ class Episode:
 
 
 _REQUIRED = ("actions", "reward", "reward_raw", "agent_mask")
-_OPTIONAL = ("messages", "adjacency")
+_OPTIONAL = ("messages", "adjacency", "frames")
 _DISCS = tuple(f"scene.{group}.{part}" for group in ("agents", "marks") for part in Discs._fields)
 _SCENE = (*_DISCS, "scene.lines", "scene.ground")
 _MASKS = ("agent_mask", "adjacency", *(name for name in _SCENE if name.endswith((".there", ".lit"))))
@@ -140,6 +149,7 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         "agent_mask": (steps, agents),
         "messages": (steps, None, agents, None),
         "adjacency": (steps, agents, agents),
+        "frames": (steps + 1, None, None, 3),
         **{f"scene.{g}.{part}": (steps + 1, n, *rest) for g, n in counts.items() for part, rest in disc.items()},
         "scene.lines": (steps + 1, None, 2, 2),
         "scene.ground": (steps + 1, 2, 2),
@@ -211,8 +221,11 @@ def record_many(
 ) -> list[Episode]:
     """K episodes, each up to its end: the very episodes that `evaluate` measures with the same arguments.
 
-    look: what is to be seen of a state; without it discs, where the task says where its agents are.
+    look: what is to be seen of a state; without it discs, where the task says where its agents are. An environment that
+    lives in Python draws its own pictures.
     """
+    if isinstance(env, Hosted):
+        return _record_on_host(env, on_host.actors(env, policy, initial_memory, intervention), key, num_episodes)
 
     @jax.jit
     def program(memory: Memory, params: EnvParams, key: PRNGKey) -> Played:
@@ -238,14 +251,24 @@ def play(
     ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
         keys = jax.random.split(key, (num_episodes, 3))
         after, step = rollout.act(env, policy, params, carry, keys, intervention)
-        seen = _view(look, after.env_state, step.next_observation, params)
+        seen = seen_of(look, after.env_state, step.next_observation, params)
         return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
 
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
-    opening = _view(look, carry.env_state, carry.observation, params)
+    opening = seen_of(look, carry.env_state, carry.observation, params)
     _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
     scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
+    return _played(steps, done, scene)
+
+
+def cut(played: Played) -> list[Episode]:
+    """Return what was played side by side as episodes, each up to its end."""
+    played = jax.device_get(played)
+    return [_episode(played, k) for k in range(played.done.shape[1])]
+
+
+def _played(steps: Transition, done: Bool[Array, "T E"], scene: Scene | None = None) -> Played:
     return Played(
         scene=scene,
         actions=steps.decision.action,
@@ -258,13 +281,40 @@ def play(
     )
 
 
-def cut(played: Played) -> list[Episode]:
-    """Return what was played side by side as episodes, each up to its end."""
-    played = jax.device_get(played)
-    return [_episode(played, k) for k in range(played.done.shape[1])]
+_FRAMES_BYTES = 256 * 2**20
+"""Of all pictures that environments draw, at most."""
+_FRAMES_WIDTH = 480
 
 
-def _view(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
+def _record_on_host(env: Hosted, playing: on_host.Actors, key: PRNGKey, num_episodes: int) -> list[Episode]:
+    """The same, of an environment that lives in Python, with the pictures that it draws."""
+    room = _FRAMES_BYTES / (num_episodes * (env.max_cycles + 1))
+    width = min(_FRAMES_WIDTH, int((room / 3) ** 0.5))
+    recorded: list[Episode] = []
+    for episodes in on_host.batches(num_episodes):
+        frames: list[Any] = []
+
+        def look(copies: Copies, frames: list[Any] = frames) -> None:
+            frames.append(copies.pictures(width))
+
+        moments = list(on_host.play(env, playing, key, episodes, look))
+        steps = rollout.happened(
+            *_stacked([(moment.decided, moment.decision, moment.after) for moment in moments])
+        )
+        played = jax.device_get(_played(steps, steps.terminated | steps.truncated))
+        for k in range(len(episodes)):
+            episode = _episode(played, k)
+            shown = [moment[k] for moment in frames[: episode.num_steps + 1] if moment is not None]
+            recorded.append(replace(episode, frames=np.stack(shown) if shown else None))
+    return recorded[:num_episodes]
+
+
+@jax.jit
+def _stacked(steps: list[Any]) -> Any:
+    return jax.tree.map(lambda *rows: jnp.stack(rows), *steps)
+
+
+def seen_of(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
     """Return what is to be seen of each environment [E, …]: discs where nobody says how to look."""
     if look is not None:
         return jax.vmap(look, (0, None))(state, params)
@@ -289,11 +339,11 @@ def _episode(played: Played, k: int) -> Episode:
         reward=np.array(played.reward[:steps, k]),
         reward_raw=np.array(played.reward_raw[:steps, k]),
         agent_mask=np.array(played.agent_mask[:steps, k]),
-        scene=_sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
+        scene=sized(jax.tree.map(lambda leaf: rows(leaf, steps + 1), played.scene)),
     )
 
 
-def _sized(scene: Scene | None) -> Scene | None:
+def sized(scene: Scene | None) -> Scene | None:
     """Agents without a radius get one that suits the picture: a twentieth of the way that all of them cover."""
     if scene is None or scene.agents.radius.any():
         return scene

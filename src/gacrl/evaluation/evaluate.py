@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams
+from gacrl.envs.hosted import Hosted
+from gacrl.evaluation import on_host
 from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_steps, table_of
 from gacrl.tasks.task import RETURN, Metric
 from gacrl.types import Intervention, Memory, Policy, PRNGKey
@@ -40,8 +42,11 @@ def evaluate(
 
     intervention: what happens to the agents' messages. metrics: those of the task; a measure without one gets its
     mean. The key fixes the starts and the policy's draws:
-    the same key gives every policy the same starts.
+    the same key gives every policy the same starts. An environment that lives in Python is played by the host.
     """
+    if isinstance(env, Hosted):
+        playing = on_host.actors(env, policy, initial_memory, intervention)
+        return jax.tree.map(jnp.asarray, on_host.evaluate(env, playing, key, num_episodes, metrics))
     start_key, act_key = jax.random.split(key)
     carry = rollout.start(env, params, initial_memory, start_key, num_episodes, intervention, policy)
     first_step = jax.eval_shape(

@@ -94,7 +94,7 @@ def scripted_program(
         policy, memory = actor(found, name, env)  # in here: its numbers have the precision of the trace
         return evaluate(env, policy, memory, params, key, num_episodes, metrics=found.metrics)
 
-    return jax.jit(play)
+    return play if env.hosted else jax.jit(play)
 
 
 def look_of(task: Task, settings: Any) -> Look | None:

@@ -95,6 +95,8 @@ def ours(settings: Any) -> tuple[str, Any] | None:
 def flag(name: str) -> str:
     """What a command needs besides to find this task again: nothing for the default one."""
     own = _OWN.get(name)
+    if own is not None and ":" in name:
+        return f" --env {shlex.quote(name)}"
     if own is not None:
         return " --env " + shlex.quote(f"{own.source or 'FILE.py'}:{name}")
     return "" if name == DEFAULT else f" --env {name}"

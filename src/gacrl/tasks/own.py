@@ -24,9 +24,12 @@ from gacrl.envs.environment import Environment, TimeStep
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.scene import Scene
 from gacrl.tasks import Own
+from gacrl.tasks.foreign import jaxmarl, pettingzoo
 from gacrl.tasks.task import RETURN, Task
 from gacrl.types import Observation
 
+_SCHEMES = {pettingzoo.SCHEME: pettingzoo.by_module, jaxmarl.SCHEME: jaxmarl.by_name}
+"""Environments of other libraries, by how their names begin."""
 _SIZES = ("num_agents", "num_actions", "observation_size", "max_cycles")
 
 
@@ -38,8 +41,9 @@ class NoSettings:
 def bring(env: Any) -> tuple[str, Any]:
     """Have a task at hand; returns its name, and the settings that stand where none are said.
 
-    env: the name of a task, `FILE.py:NAME`, a `Task`, a subclass of `Environment` or an instance of one. Raises
-    ConfigError, with one sentence, for what is none of these, or for a task that does not keep its word.
+    env: the name of a task, `FILE.py:NAME`, `pettingzoo:MODULE`, `jaxmarl:NAME`, a `Task`, a subclass of `Environment`
+    or an instance of one. Raises ConfigError, with one sentence, for what is none of these, or for a task that does not
+    keep its word.
     """
     if isinstance(env, str):
         name = _by_name(env)
@@ -54,6 +58,12 @@ def bring(env: Any) -> tuple[str, Any]:
 
 
 def _by_name(name: str) -> str:
+    scheme = next((scheme for scheme in _SCHEMES if name.startswith(scheme)), None)
+    if scheme is not None:
+        own = _SCHEMES[scheme](name)
+        examine(own)
+        tasks.bring(own)
+        return name
     path, colon, attribute = name.rpartition(":")
     if not colon or not path.endswith(".py"):
         tasks.find(name)

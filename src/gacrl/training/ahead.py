@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from gacrl.config.run import RunConfig
 from gacrl.training.build import member_shapes, stacked_shapes
 from gacrl.training.recorder import SHOWN_EPISODES
-from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.trainer import AbstractTrainer, Trainer, TrainState
 
 Lower: TypeAlias = Callable[[], Any]
 """Makes what XLA compiles of a program; whoever calls that program later finds it compiled."""
@@ -74,14 +74,24 @@ class Ahead:
 class Programs:
     """The programs of a training, being compiled."""
 
-    chunk: Future[Any]
-    """A function of the state and a number of updates."""
-    monitor: tuple[Future[Any], ...]
+    chunk: tuple[Future[Any], ...] = ()
+    monitor: tuple[Future[Any], ...] = ()
     """The evaluations along the way."""
 
 
-def prepare(ahead: Ahead, trainer: Trainer, config: RunConfig, fresh: bool = False) -> Programs:
-    """Begin to compile what training needs. fresh: wait for what makes training states, which it begins with."""
+def wait(programs: tuple[Future[Any], ...]) -> None:
+    """Return when they are compiled. Raises what lowering or compiling raised."""
+    for program in programs:
+        program.result()
+
+
+def prepare(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig, fresh: bool = False) -> Programs:
+    """Begin to compile what training needs; nothing where the environments live in Python.
+
+    fresh: wait for what makes training states, which it begins with.
+    """
+    if not isinstance(trainer, Trainer):
+        return Programs()
     learner, count = _laid_out(trainer).learner, config.evaluation.num_episodes
     chunk = ahead.compile(lambda: trainer.chunk.lower(_laid_out(trainer), 1))
     start = ahead.compile(lambda: trainer.lower_init(config.seeds[0])) if fresh else None
@@ -91,7 +101,7 @@ def prepare(ahead: Ahead, trainer: Trainer, config: RunConfig, fresh: bool = Fal
     )
     if start is not None:
         start.result()
-    return Programs(chunk, monitor)
+    return Programs((chunk,), monitor)
 
 
 def closing(trainer: Trainer, config: RunConfig) -> tuple[Lower, ...]:

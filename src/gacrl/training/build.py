@@ -18,8 +18,9 @@ from gacrl.tasks.task import Task
 from gacrl.training import curriculum, footprint
 from gacrl.training.curriculum import constant
 from gacrl.training.devices import mesh_for
+from gacrl.training.host_trainer import HostTrainer
 from gacrl.training.recorder import SHOWN_EPISODES
-from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.trainer import AbstractTrainer, Trainer, TrainState
 from gacrl.types import Intervention, Learner
 
 
@@ -47,7 +48,7 @@ def make_trainer(
     devices: Mesh | None = None,
     learns: bool = True,
     intervention: Intervention | None = None,
-) -> Trainer:
+) -> AbstractTrainer:
     """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`.
 
     learns: False for policies that are only played: the task then does not move. intervention: what happens to their
@@ -58,7 +59,8 @@ def make_trainer(
     params = task.numbers(config.env, env, getattr(config.algorithm, "gamma", 1.0))
     evaluated = evaluated_settings(config)
     evaluation_env = task.make(evaluated)
-    return Trainer(
+    kind = HostTrainer if env.hosted else Trainer
+    return kind(
         algorithm=algorithm,
         env=env,
         params=params,
@@ -71,7 +73,7 @@ def make_trainer(
         evaluation_params=task.numbers(evaluated, evaluation_env),
         mesh=mesh(config, algorithm) if devices is None else devices,
         for_speed=algorithm.compiled_for_speed,
-        watched=tasks.brought(config.task) is not None,
+        watched=tasks.brought(config.task) is not None and not env.hosted,  # the host looks itself
         look=look_of(task, evaluated),
         intervention=interventions.parse(config.training.intervention) if intervention is None else intervention,
     )
@@ -101,7 +103,7 @@ def evaluated_settings(config: RunConfig) -> Any:
     return config.env if horizon is None else task.with_horizon(config.env, horizon)
 
 
-def plan(trainer: Trainer, config: RunConfig) -> Plan:
+def plan(trainer: AbstractTrainer, config: RunConfig) -> Plan:
     """Count what a run needs, without allocating it. Raises UserError where this machine has not the memory."""
     member, devices = member_shapes(trainer), list(trainer.mesh.devices.flat)
     state, working = footprint.size(member), footprint.working_bytes(config, trainer.algorithm, member)
@@ -132,17 +134,17 @@ def _notes(config: RunConfig) -> Iterator[str]:
         )
 
 
-def member_shapes(trainer: Trainer) -> TrainState:
+def member_shapes(trainer: AbstractTrainer) -> TrainState:
     """The shapes of a seed's training state."""
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
 
 
-def stacked_shapes(trainer: Trainer, num_seeds: int | None = None) -> TrainState:
+def stacked_shapes(trainer: AbstractTrainer, num_seeds: int | None = None) -> TrainState:
     """The shapes of the training state of all seeds, as a checkpoint holds it; or of so many."""
     return _stacked(member_shapes(trainer), trainer.num_seeds if num_seeds is None else num_seeds)
 
 
-def learner_shapes(trainer: Trainer) -> Learner:
+def learner_shapes(trainer: AbstractTrainer) -> Learner:
     """The shapes of the learners of all seeds. Environments, and what happens to messages in them, do not matter."""
     algorithm = trainer.algorithm
     return _stacked(jax.eval_shape(lambda: algorithm.init(jax.random.key(0), algorithm.hyper)), trainer.num_seeds)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gacrl.algorithms.replay import Replay
-from gacrl.errors import UserError
+from gacrl.errors import Faulty, UserError
 from gacrl.types import Learner
 
 
@@ -41,10 +41,6 @@ def not_finite(
             bad = member[~np.isfinite(member)]
             if bad.size:
                 yield seed, name, f"{bad[0]} in {bad.size} of {member.size} places"
-
-
-class Faulty(UserError):
-    """A task has given an observation or a reward that is no finite number."""
 
 
 def require_sound_task(seeds: Sequence[int], task: str, fault: Any) -> None:

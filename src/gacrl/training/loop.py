@@ -15,12 +15,12 @@ from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.metrics import EpisodeSummary
 from gacrl.render import num_frames
-from gacrl.training.ahead import Ahead, Programs, prepare
+from gacrl.training.ahead import Ahead, Programs, prepare, wait
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task
 from gacrl.training.forecast import closing_seconds, seconds_left
 from gacrl.training.recorder import SHOWN_EPISODES
-from gacrl.training.trainer import ChunkReport, Trainer, TrainState
+from gacrl.training.trainer import AbstractTrainer, ChunkReport, TrainState
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Progress:
 
 
 def train(
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     config: RunConfig,
     state: TrainState,
     env_steps: int = 0,
@@ -91,7 +91,8 @@ def train(
         updates = min(config.updates_per_chunk, total - done)
         if chunk is None:
             begun = time.perf_counter()
-            chunk = programs.chunk.result()
+            wait(programs.chunk)
+            chunk = trainer.compiled(state, updates)
             compiling += time.perf_counter() - begun
             wait_for_all()
         begun = time.perf_counter()
@@ -101,8 +102,7 @@ def train(
         timed += updates * per_update * len(config.seeds)
         done += updates
         begun = time.perf_counter()
-        for program in programs.monitor:
-            program.result()
+        wait(programs.monitor)
         compiling += time.perf_counter() - begun
         begun = time.perf_counter()
         evaluations = {
@@ -125,7 +125,7 @@ def train(
         yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole, left)
 
 
-def _closing(trainer: Trainer, config: RunConfig, playing: float) -> float:
+def _closing(trainer: AbstractTrainer, config: RunConfig, playing: float) -> float:
     """Seconds that will pass after the last chunk."""
     more = config.evaluation.final_episodes / config.evaluation.num_episodes
     return closing_seconds(playing, more, SHOWN_EPISODES * num_frames(trainer.evaluation_env.max_cycles))

@@ -92,9 +92,11 @@ class RunFolder:
         except ConfigError as error:
             name = self._task_that_is_missing()
             if name is not None:
+                again = (
+                    f"name it again, --env {name}" if ":" in name else "name its file again, --env FILE.py:NAME"
+                )
                 raise UserError(
-                    f"{self.path} is of the task {name}, which is not at hand: name its file again, "
-                    "--env FILE.py:NAME, in Python env="
+                    f"{self.path} is of the task {name}, which is not at hand: {again}, in Python env="
                 ) from error
             raise UserError(str(error)) from error
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
@@ -15,8 +16,9 @@ from gacrl.config import files as configuration
 from gacrl.config.checks import whole
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
-from gacrl.errors import UserError
+from gacrl.errors import Faulty, UserError
 from gacrl.evaluation import episodes
+from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
@@ -30,11 +32,11 @@ from gacrl.training.build import (
     stacked_shapes,
 )
 from gacrl.training.devices import anyone, gathered, leads, one_seed, same_everywhere, shard_seeds
-from gacrl.training.divergence import Diverged, Faulty
+from gacrl.training.divergence import Diverged
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
-from gacrl.training.recorder import RunFolder
-from gacrl.training.trainer import Trainer, TrainState
+from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
+from gacrl.training.trainer import AbstractTrainer, Trainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 from gacrl.types import Learner
@@ -82,7 +84,7 @@ def start(
         return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
 
 
-def begin_with(trainer: Trainer, config: RunConfig, parent: Parent) -> TrainState:
+def begin_with(trainer: AbstractTrainer, config: RunConfig, parent: Parent) -> TrainState:
     """A fresh training state, stacked, with what the parent has learned."""
     state, algorithm = trainer.init_stacked(config.seeds), trainer.algorithm
     like = jax.tree.map(
@@ -159,7 +161,7 @@ def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpo
     return found
 
 
-def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
+def restore(trainer: AbstractTrainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
     """The training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
@@ -171,7 +173,7 @@ def restore(trainer: Trainer, config: RunConfig, found: checkpoint.Checkpoint | 
 def _run(
     folder: RunFolder,
     config: RunConfig,
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
@@ -186,7 +188,7 @@ def _to_the_end(
     ahead: Ahead,
     folder: RunFolder,
     config: RunConfig,
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     found: checkpoint.Checkpoint | None,
     watcher: Watcher,
     fingerprint: str,
@@ -195,7 +197,9 @@ def _to_the_end(
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     watcher.compiling()
     programs = prepare(ahead, trainer, config, fresh=found is None and begun is None)
-    ending = ahead.run(_prepare_ending, ahead, trainer, config)
+    ending = partial(_prepare_ending, ahead, trainer, config)
+    if isinstance(trainer, Trainer):  # what lives in Python plays one thing at a time
+        ending = ahead.run(ending).result
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
     with folder.writing(config.task):
         if leads():
@@ -223,7 +227,7 @@ def _to_the_end(
             if anyone(watcher.stop()) and not progress.done:
                 return Ended(folder.path, config, env_steps, None)
     watcher.finishing()
-    summary = _finish(folder, config, trainer, state, env_steps, clock, ending.result())
+    summary = _finish(folder, config, trainer, state, env_steps, clock, ending())
     watcher.finished(summary)
     return Ended(folder.path, config, env_steps, summary)
 
@@ -259,15 +263,19 @@ def _clock(found: checkpoint.Checkpoint) -> Clock:
 class _Ending(NamedTuple):
     """What closes a run and does not wait for its policy."""
 
-    record: Any
-    """Compiled: episodes of a seed's learner."""
+    record: Callable[[Learner], list[episodes.Episode]]
+    """Episodes of a seed's learner to look at."""
     references: dict[str, dict[str, float]]
     """The metrics of policies that learn nothing, where this process writes them."""
 
 
-def _prepare_ending(ahead: Ahead, trainer: Trainer, config: RunConfig) -> _Ending:
+def _prepare_ending(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig) -> _Ending:
     """Compile what closes a run, and play the policies that learn nothing."""
-    *_, record = [ahead.compiled(lower) for lower in closing(trainer, config)]
+    if isinstance(trainer, Trainer):
+        *_, program = [ahead.compiled(lower) for lower in closing(trainer, config)]
+        record = partial(_record, program)
+    else:
+        record = partial(_record_on_host, trainer)
     if ahead.left or not leads():
         return _Ending(record, {})
     settings, count = evaluated_settings(config), config.evaluation.final_episodes
@@ -277,7 +285,7 @@ def _prepare_ending(ahead: Ahead, trainer: Trainer, config: RunConfig) -> _Endin
 def _finish(
     folder: RunFolder,
     config: RunConfig,
-    trainer: Trainer,
+    trainer: AbstractTrainer,
     state: TrainState,
     env_steps: int,
     clock: Clock,
@@ -294,7 +302,7 @@ def _finish(
     if not leads():
         return {}
     facts, members = task.facts(settings, trainer.table.names), len(config.seeds)
-    _show(folder, config, episodes.cut(ending.record(learner)))
+    _show(folder, config, ending.record(learner))
     summary = {
         "preset": config.preset,
         "task": facts,
@@ -319,6 +327,17 @@ def _finish(
     return summary
 
 
+def _record(program: Callable[[Learner], episodes.Played], learner: Learner) -> list[episodes.Episode]:
+    return episodes.cut(program(learner))
+
+
+def _record_on_host(trainer: AbstractTrainer, learner: Learner) -> list[episodes.Episode]:
+    """The same episodes, of an environment that lives in Python."""
+    policy, key = trainer.algorithm.policy(learner, False), stream_key("report")
+    env, params = trainer.evaluation_env, trainer.evaluation_params
+    return episodes.record_many(env, policy, trainer.memory, params, key, SHOWN_EPISODES, trainer.intervention)
+
+
 def _show(folder: RunFolder, config: RunConfig, shown: list[episodes.Episode]) -> None:
     """Keep episodes of the first seed to look at, and as a GIF where there is something to see."""
     task = tasks.find(config.task)
@@ -326,12 +345,12 @@ def _show(folder: RunFolder, config: RunConfig, shown: list[episodes.Episode]) -
         folder.episodes.mkdir(exist_ok=True)
         for number, episode in enumerate(shown):
             episode.save(folder.episodes / f"{number}.npz")
-        if shown and shown[0].scene is not None:
+        if shown and shown[0].visible:
             title = f"{label(config)}, seed {config.seed}"
             render.gif(shown, folder.gif, title=title, words=task.words)
 
 
-def load_learners(found: checkpoint.Checkpoint, trainer: Trainer) -> Learner:
+def load_learners(found: checkpoint.Checkpoint, trainer: AbstractTrainer) -> Learner:
     """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = trainer.algorithm.acting(learner_shapes(trainer))
     learners = checkpoint.load(found, shapes, prefix=".learner")

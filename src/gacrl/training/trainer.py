@@ -3,9 +3,10 @@
 A trainer knows no particular algorithm; what it trains is an `Algorithm` record.
 """
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -79,6 +80,10 @@ def earlier(first: Fault | None, fault: Fault | None) -> Fault | None:
     return jax.tree.map(lambda old, new: jnp.where(known, old, new), first, fault)
 
 
+Update: TypeAlias = tuple[TrainState, EpisodeSummary, Metrics, Fault | None]
+"""The state after an update, the episodes that ended in it, what it measured, and its first fault."""
+
+
 class ChunkReport(NamedTuple):
     """What a chunk of updates showed."""
 
@@ -91,12 +96,24 @@ class ChunkReport(NamedTuple):
     """The first number of the task that was not finite; None where nobody looks."""
 
 
-class Trainer:
-    """Compiled functions over stacked seeds (the seeds' axis in front of every leaf).
+class Running(NamedTuple):
+    """A chunk so far."""
 
-    `chunk` and `evaluate` compile once each; `num_updates` is data, so that a shorter last chunk does not
-    compile again.
-    """
+    state: TrainState
+    seen: EpisodeSummary
+    totals: Metrics
+    """The sums of the updates' metrics."""
+    used: EnvParams
+    """The task's parameters in the last update."""
+    fault: Fault | None
+
+
+Chunk: TypeAlias = Callable[[TrainState, Any], tuple[TrainState, ChunkReport]]
+"""(state, number of updates) -> the state after them, and what they showed; over stacked seeds."""
+
+
+class AbstractTrainer(ABC):
+    """Functions over stacked seeds (the seeds' axis in front of every leaf): all but how experience is gathered."""
 
     def __init__(
         self,
@@ -126,7 +143,7 @@ class Trainer:
         self.num_steps = num_steps
         self.num_seeds = num_seeds
         self.for_speed = for_speed
-        """How `chunk` is compiled: see `devices.compiler_options`."""
+        """How training is compiled: see `devices.compiler_options`."""
         self.evaluation_env = env if evaluation_env is None else evaluation_env
         self.params = env.default_params() if params is None else params
         self.evaluation_params = (
@@ -138,9 +155,7 @@ class Trainer:
         self.memory = algorithm.initial_memory(env.num_agents)
         self.table = table_of(measures_of(env, self.params), metrics)
         """What the vectors of a chunk's episode summary hold."""
-        self.chunk = jax.jit(
-            map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=compiler_options(for_speed)
-        )
+        self.chunk = self.make_chunk()
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
         """Fresh training states of these seeds, stacked."""
@@ -178,19 +193,27 @@ class Trainer:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def _update(self, state: TrainState) -> tuple[TrainState, EpisodeSummary, Metrics, Fault | None]:
-        """Gather experience, learn from it, move the task on: one turn of the loop."""
-        rollout_key, update_key, key = jax.random.split(state.key, 3)
-        carry, experience = rollout.collect(
-            self.env,
-            self.algorithm.policy(state.learner, True),
-            self.memory,
-            state.env_params,
-            share_out(state.carry),
-            rollout_key,
-            self.num_steps,
-            self.intervention,
-        )
+    @abstractmethod
+    def make_chunk(self) -> Any:
+        """Return the chunk of updates that `chunk` is: it may keep what it is given."""
+
+    @abstractmethod
+    def compiled(self, state: TrainState, num_updates: int) -> Chunk:
+        """Compile what a chunk needs, and return the chunk. The state stays as it is."""
+
+    @abstractmethod
+    def evaluate(self, learners: Learner, explore: bool, stream: Stream, num_episodes: int) -> dict[str, Any]:
+        """The metrics of K fixed episodes of each seed's learner, [S, K], in the evaluation's task."""
+
+    def learn(
+        self,
+        state: TrainState,
+        carry: rollout.Carry,
+        experience: rollout.Rollout,
+        update_key: PRNGKey,
+        key: PRNGKey,
+    ) -> Update:
+        """Learn from experience, and move the task on. carry: where the environments stand after it."""
         learner, metrics = self.algorithm.update(state.learner, experience, update_key)
         env_steps = (state.updates + 1) * (self.num_envs * self.num_steps)
         curriculum, env_params = self.curriculum.advance(state.curriculum, env_steps, experience)
@@ -220,33 +243,74 @@ class Trainer:
             tally, episodes = jax.lax.scan(one_step, tally, inputs)
         return tally, sum_up(episodes, inputs[1])
 
+    def none_yet(self, state: TrainState, update: Any) -> Running:
+        """A chunk before its first update, given the shapes of an `Update`."""
+        _, _, *shapes = update
+        zeros, unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return Running(state, no_episodes(self.table), zeros, state.env_params, unseen)
+
+
+def follow(running: Running, update: Update) -> Running:
+    """Take in one more update."""
+    state, episodes, metrics, fault = update
+    seen = EpisodeSummary(
+        ended=running.seen.ended + episodes.ended,
+        total=running.seen.total + episodes.total,
+        squares=running.seen.squares + episodes.squares,
+        last=jnp.where(episodes.ended > 0, episodes.last, running.seen.last),
+    )
+    totals = jax.tree.map(jnp.add, running.totals, metrics)
+    return Running(state, seen, totals, running.state.env_params, earlier(running.fault, fault))
+
+
+def closed(running: Running, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
+    """The state after a chunk, and what the chunk showed."""
+    metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), running.totals)
+    return running.state, ChunkReport(running.seen, metrics, running.used, running.fault)
+
+
+class Trainer(AbstractTrainer):
+    """A trainer whose chunk is one program, environments included.
+
+    `chunk` and `evaluate` compile once each; `num_updates` is data, so that a shorter last chunk does not
+    compile again.
+    """
+
+    def make_chunk(self) -> Any:
+        """Return the program, not yet compiled."""
+        options = compiler_options(self.for_speed)
+        return jax.jit(map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=options)
+
+    def compiled(self, state: TrainState, num_updates: int) -> Chunk:
+        """Compile a chunk of any length."""
+        return self.chunk.lower(state, num_updates).compile()
+
+    def _update(self, state: TrainState) -> Update:
+        """Gather experience, learn from it, move the task on: one turn of the loop."""
+        rollout_key, update_key, key = jax.random.split(state.key, 3)
+        carry, experience = rollout.collect(
+            self.env,
+            self.algorithm.policy(state.learner, True),
+            self.memory,
+            state.env_params,
+            share_out(state.carry),
+            rollout_key,
+            self.num_steps,
+            self.intervention,
+        )
+        return self.learn(state, carry, experience, update_key, key)
+
     def chunk_of_one(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
         """`num_updates` turns of the loop, for one seed."""
         update = jax.jit(self._update, inline=True)  # traced once for the shapes and the loop
-
-        def body(
-            _: Int[Array, ""], loop: tuple[TrainState, EpisodeSummary, Metrics, EnvParams, Fault | None]
-        ) -> tuple[TrainState, EpisodeSummary, Metrics, EnvParams, Fault | None]:
-            state, seen, totals, _, first = loop
-            used = state.env_params
-            state, episodes, metrics, fault = update(state)
-            seen = EpisodeSummary(
-                ended=seen.ended + episodes.ended,
-                total=seen.total + episodes.total,
-                squares=seen.squares + episodes.squares,
-                last=jnp.where(episodes.ended > 0, episodes.last, seen.last),
-            )
-            return state, seen, jax.tree.map(jnp.add, totals, metrics), used, earlier(first, fault)
-
-        _, _, shapes, fault = jax.eval_shape(update, state)
-        zeros, unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (shapes, fault))
-        start = (state, no_episodes(self.table), zeros, state.env_params, unseen)
-        state, seen, totals, used, fault = jax.lax.fori_loop(0, num_updates, body, start)
-        metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), totals)
-        return state, ChunkReport(seen, metrics, used, fault)
+        start = self.none_yet(state, jax.eval_shape(update, state))
+        running = jax.lax.fori_loop(
+            0, num_updates, lambda _, running: follow(running, update(running.state)), start
+        )
+        return closed(running, num_updates)
 
     @partial(jax.jit, static_argnums=(0, 2, 3, 4))
-    def evaluate(
+    def evaluate(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[Array, "S K"]]:
         """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""

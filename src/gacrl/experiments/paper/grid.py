@@ -31,7 +31,7 @@ from gacrl.training import build
 from gacrl.training.devices import shard_seeds, stack_seeds
 from gacrl.training.divergence import not_finite
 from gacrl.training.recorder import RunFolder
-from gacrl.training.trainer import Trainer
+from gacrl.training.trainer import AbstractTrainer
 
 SCORE = "reward_shaped"
 _RESULTS, _MARKER = "results.jsonl", "sweep.json"
@@ -203,7 +203,12 @@ def expected_range(count: int) -> float:
 
 
 def _train_missing(
-    grid: Grid, trainer: Trainer, members: Sequence[Member], out: Path, say: Callable[[str], None], more: int = 0
+    grid: Grid,
+    trainer: AbstractTrainer,
+    members: Sequence[Member],
+    out: Path,
+    say: Callable[[str], None],
+    more: int = 0,
 ) -> Scores:
     """The scores of all these members; those that are not in the folder yet are trained, group by group.
 
@@ -225,7 +230,12 @@ def _train_missing(
 
 
 def _train(
-    grid: Grid, trainer: Trainer, group: Sequence[Member], say: Callable[[str], None], pace: Pace, before: int
+    grid: Grid,
+    trainer: AbstractTrainer,
+    group: Sequence[Member],
+    say: Callable[[str], None],
+    pace: Pace,
+    before: int,
 ) -> list[float]:
     """The mean score of each member's episodes; −∞ where it diverged, since whoever then stands still scores well.
 
@@ -260,7 +270,7 @@ def _so_far(total: np.ndarray, ended: np.ndarray) -> str:
     return f"episode {int(ended[0])}, mean shaped reward so far {np.mean(total / ended):.2f}"
 
 
-def _hyper(trainer: Trainer, point: Point) -> Any:
+def _hyper(trainer: AbstractTrainer, point: Point) -> Any:
     hyper = trainer.algorithm.hyper
     return hyper._replace(
         learning_rate=point.learning_rate,
