@@ -224,18 +224,12 @@ def a_step(library: Library, rng: np.random.Generator, end: bool, coverage: floa
     )
 
 
-def rows_of(experience: Any, noise: Any) -> list[Seen]:
-    e, n = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (experience, noise))
+def rows_of(bits: tuple[Any, ...]) -> list[Seen]:
+    """What the loss was given, from the halves of its float64s."""
+    o, near, a, r, latent, gumbel = (np.ascontiguousarray(half).view(np.float64)[..., 0] for half in bits)
     return [
-        Seen(
-            e.features[k],
-            e.adjacency[k],
-            e.action[k].astype(int),
-            float(e.reward[k]),
-            n.latent[..., k].T,
-            n.gumbel[..., k].T,
-        )
-        for k in range(len(e.reward))
+        Seen(o[k], near[k] > 0, a[k].astype(int), float(r[k]), latent[..., k].T, gumbel[..., k].T)
+        for k in range(len(r))
     ]
 
 
@@ -244,13 +238,16 @@ def test_five_updates_are_those_of_the_paper(monkeypatch: pytest.MonkeyPatch):
 
     Only which rows were drawn, and the noise of (3) and (9), are taken from the library: they are chance.
     """
-    rng, given, original = np.random.default_rng(11), [], gacrl_paper.loss
+    rng, told_of, original = np.random.default_rng(11), [], gacrl_paper.loss
 
-    def overheard(network: Any, hyper: Any, rows: Any, temperature: Any, noise: Any, config: Any):
-        jax.debug.callback(lambda *seen: given.append(seen), rows, noise)
+    def telling(network: Any, hyper: Any, rows: Any, temperature: Any, noise: Any, config: Any):
+        given = (rows.features, rows.adjacency, rows.action, rows.reward, noise.latent, noise.gumbel)
+        # As halves: a callback runs in a thread of its own, where float64 would be cut to float32.
+        halves = [jax.lax.bitcast_convert_type(value.astype(float), jnp.uint32) for value in given]
+        jax.debug.callback(lambda *bits: told_of.append(bits), *halves)
         return original(network, hyper, rows, temperature, noise, config)
 
-    monkeypatch.setattr(gacrl_paper, "loss", overheard)
+    monkeypatch.setattr(gacrl_paper, "loss", telling)
     with jax.enable_x64(True):
         w, b = fresh(rng)
         library = Library(w, b)
@@ -267,7 +264,7 @@ def test_five_updates_are_those_of_the_paper(monkeypatch: pytest.MonkeyPatch):
             keys = jax.random.split(jax.random.key(t), 1)
             learner, told = learn(learner, (jax.tree.map(lambda leaf: leaf[None], step), keys))
             jax.effects_barrier()
-            rows = rows_of(*given[t])
+            rows = rows_of(told_of[t])
             np.testing.assert_array_equal(rows[-1].o, step.observation.features)
             (policy, critic, kl), slope = loss_and_slope(w, b, rows, tau)
             ours = [told[name] for name in ("loss_policy", "loss_critic", "loss_kl", "epsilon", "temperature")]

@@ -197,8 +197,8 @@ def _with_fixed_ratio(metrics: Metrics, ratio: float | np.ndarray) -> Metrics:
     r_raw at the ratio r is −r · collisions − (1 − r) · 3 · distance from landmarks, so that at r it is less by
     (1 − 2r)(r_raw + 3 · distance) than what is logged, at 0.5.
     """
-    less = (1.0 - 2.0 * np.asarray(ratio)) * (metrics["reward_raw"] + 3.0 * metrics["distance_landmark_agent"])
-    return {**metrics, FIXED_RATIO: metrics["reward_shaped"] + less}
+    missing = (1.0 - 2.0 * np.asarray(ratio)) * (metrics["reward_raw"] + 3.0 * metrics["distance_landmark_agent"])
+    return {**metrics, FIXED_RATIO: metrics["reward_shaped"] + missing}
 
 
 def gather(

@@ -3,6 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from gacrl.experiments.paper import tables as paper_tables
 from gacrl.experiments.paper.claims import (
     AGREES,
@@ -19,7 +22,7 @@ from gacrl.experiments.paper.claims import (
     Reading,
     measures,
 )
-from gacrl.experiments.paper.evidence import Evidence
+from gacrl.experiments.paper.evidence import Evidence, measured
 from gacrl.experiments.paper.spans import (
     ROUNDING,
     Row,
@@ -32,6 +35,8 @@ from gacrl.experiments.paper.spans import (
 
 WIDE = 3.0
 """Our interval decides nothing where it is so many times as wide as random's: any number would be in it."""
+
+Values = Float[np.ndarray, " S"]
 
 Printed = Mapping[str, tuple[Row, tuple[float, ...]]]
 """Rows of a table and their numbers, under what a claim calls them."""
@@ -52,7 +57,15 @@ def value(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     there = [name for name, (row, _) in table.items() if evidence.has(reading.column, row.who)]
     spans = dict(zip(there, table_spans(tuple(table[name][0] for name in there), reading, evidence), strict=True))
     cells = [
-        _Cell(row.who, reading.measure(measure), number, ours, random, column=measures()[measure].label)
+        _Cell(
+            row.who,
+            reading.measure(measure),
+            number,
+            ours,
+            random,
+            _seeds(row, measure, reading, evidence),
+            column=measures()[measure].label,
+        )
         for name, (row, numbers) in table.items()
         if name in asked
         for measure, number, ours, random in zip(row.measures, numbers, *spans[name], strict=True)
@@ -85,11 +98,30 @@ def _table(claim: Claim, reading: Reading, evidence: Evidence) -> Printed:
     return {who: (Row(who, None, (name,)), (float(number),)) for who, name, number in cells}
 
 
+def _seeds(row: Row, name: str, reading: Reading, evidence: Evidence) -> Values:
+    """What each of our seeds has in a cell."""
+    weights = reading.measure(name).weights
+    if row.stretch is None:
+        return evidence.values(weights, row.who, reading.play, reading.column)
+    series = evidence.trained(reading.column, row.who)
+    return measured(weights, series.last if reading.row == "episode" else series.mean)[:, row.stretch]
+
+
 class _Cell:
     """One printed number, and where it would lie."""
 
-    def __init__(self, who: str, measure: Measure, printed: float, ours: Span, random: Span, column: str = ""):
+    def __init__(
+        self,
+        who: str,
+        measure: Measure,
+        printed: float,
+        ours: Span,
+        random: Span,
+        seeds: Values,
+        column: str = "",
+    ):
         self.who, self.label, self.printed, self.ours, self.random = who, measure.label, printed, ours, random
+        self.seeds = seeds
         self.column = column  # as it is called under any reading
         self.told = not inside(printed, random)
         wide = ours[1] - ours[0] > WIDE * (random[1] - random[0] + 2 * ROUNDING)
@@ -112,6 +144,7 @@ class _Cell:
             "who": self.who,
             "measure": self.label,
             "printed": self.printed,
+            "seeds": self.seeds,
             "ours": self.ours,
             "random": self.random,
         }
@@ -120,13 +153,15 @@ class _Cell:
 def peak(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
     """A printed best of the log against the best of as many log lines of ours, and of random."""
     measure, printed = reading.measure(claim.settings["measure"]), float(claim.settings["printed"])
-    lines = len(evidence.trained(reading.column, "GACRL").episodes)
+    series = evidence.trained(reading.column, "GACRL")
+    logged = measured(measure.weights, series.last if reading.row == "episode" else series.mean)
     cell = _Cell(
-        f"best of {lines} lines,",
+        f"best of {logged.shape[1]} lines,",
         measure,
         printed,
         best_of_ours(measure, reading, evidence),
         best_of_random(measure, reading, evidence),
+        (measure.sign * logged).max(1) * measure.sign,
     )
     because, episode = str(cell), claim.settings["episode"]
     if str(episode) not in paper_tables.printed()["table_2"]["rows"]:

@@ -89,7 +89,7 @@ def _program(name: str, task: str, settings: Any) -> Callable[..., dict[str, jax
 
 def _read(file: Path, asked: str) -> dict[str, dict[str, np.ndarray]] | None:
     try:
-        with file.open("rb") as opened, np.load(opened) as held:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as held:
             if str(held["asked"]) != asked:
                 return None
             names = [name.split("/") for name in held.files if "/" in name]
