@@ -14,5 +14,5 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     """Write the weights that act, by name, and their card. No array in it is an object: nothing is pickled."""
     it = program(source)
     with out.open("wb") as file:
-        np.savez(file, **it.weights)
+        np.savez(file, allow_pickle=False, **it.weights)
     return [out, write_card(source, it, out)]

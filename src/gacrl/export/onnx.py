@@ -1,6 +1,6 @@
 """The policy as an ONNX graph, converted by jax2onnx from the traced program and checked with onnxruntime."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
@@ -29,7 +29,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
 
 def convert(source: Source, it: Program) -> bytes:
     """Return the program as a serialised ONNX model of opset 21."""
-    from jax2onnx import to_onnx
+    from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
 
     try:
         model = to_onnx(
@@ -46,9 +46,9 @@ def convert(source: Source, it: Program) -> bytes:
     return model.SerializeToString()
 
 
-def runner(data: bytes):
+def runner(data: bytes) -> Callable[[Arrays], Arrays]:
     """Return a function that runs the model on one core: inputs by name -> outputs by name."""
-    import onnxruntime
+    import onnxruntime  # pyright: ignore[reportMissingImports]
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
