@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -196,6 +197,9 @@ def test_metrics_as_a_table(tiny_run: TinyRun, tmp_path: Path, said: Callable[..
 def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[int, str]], monkeypatch: Any):
     out, run = tmp_path / "policy.npz", tiny_run.folder
     (tmp_path / "there.npz").touch()
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run, damaged)
+    (damaged / "summary.json").write_text("{")
     for words, sentence in (
         ((run,), "say where with --out FILE"),
         ((run, "--out", tmp_path / "policy"), "does not say which format"),
@@ -206,6 +210,7 @@ def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[
         ((run, "--out", out, "--num-agent", 4), "did you mean --num-agents?"),
         ((f"{run}@7", "--out", out), "there is no @7"),
         (("oracle", "--out", out), "oracle is a script"),
+        ((damaged, "--out", out), "summary.json is damaged"),
         (("pretrained:gacrl", "--out", tmp_path / "x.csv"), "has no metrics.jsonl with an evaluation in it"),
     ):
         code, told = said("export", *words)
@@ -214,4 +219,4 @@ def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[
     for name in ("onnx", "stablehlo"):
         code, told = said("export", run, "--out", tmp_path / f"x.{name}")
         assert code == 2 and "pip install 'gacrl[onnx]'" in told, told
-    assert sorted(tmp_path.iterdir()) == [tmp_path / "there.npz"], "nothing is left of what failed"
+    assert sorted(tmp_path.iterdir()) == [damaged, tmp_path / "there.npz"], "nothing is left of what failed"

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
+from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import Program, flattened, program
 from gacrl.export.recorded import Arrays, compared
@@ -11,7 +12,7 @@ from gacrl.export.source import Source
 from gacrl.extras import require_extra
 
 OPSET = 21
-"""The newest that onnxruntime 1.20, of 2024, reads."""
+"""The version of ONNX's operators that the graph is of; it stands on the card."""
 
 
 def write(source: Source, out: Path) -> Sequence[Path]:
@@ -23,8 +24,10 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     it = program(source)
     data = convert(source, it)
     checked = compared(source, it, runner(data))
-    out.write_bytes(data)
-    return [out, write_card(source, it, out, f"{checked} Opset {OPSET}.")]
+    card = write_card(source, it, out, f"{checked} Opset {OPSET}.")
+    with written_whole(out) as file:
+        file.write(data)
+    return [out, card]
 
 
 def convert(source: Source, it: Program) -> bytes:
