@@ -164,8 +164,9 @@ def test_onnx_decides_as_the_run(name: str, tmp_path: Path):
     """The second one has axes of length 0: its agents see nobody."""
     pytest.importorskip("jax2onnx", reason="pip install 'gacrl[onnx]'")
     onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'gacrl[onnx]'")
-    out = tmp_path / "policy.onnx"
+    out, before = tmp_path / "policy.onnx", dict(vars(jax.numpy))
     formats.writer("onnx")(Source(f"pretrained:{name}"), out)
+    assert not [name for name, it in before.items() if vars(jax.numpy)[name] is not it], "JAX is as it was"
     card = (tmp_path / "policy.onnx.md").read_text()
     assert "It repeats 1,000 of 1,000" in card and "Opset 21" in card
     session = onnxruntime.InferenceSession(out.read_bytes(), providers=["CPUExecutionProvider"])

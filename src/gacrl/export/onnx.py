@@ -1,6 +1,8 @@
 """The policy as an ONNX graph, converted by jax2onnx from the traced program and checked with onnxruntime."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import sys
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
@@ -32,21 +34,37 @@ def write(source: Source, out: Path) -> Sequence[Path]:
 
 def convert(source: Source, it: Program) -> bytes:
     """Return the program as a serialised ONNX model of opset 21."""
-    from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
-
     try:
-        model = to_onnx(
-            flattened(it),
-            list(it.inputs.values()),
-            model_name=f"gacrl {source.opened.config.task}",
-            opset=OPSET,
-            input_names=list(it.inputs),
-            output_names=list(it.outputs),
-        )
+        with _jax_as_it_is():
+            from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
+
+            model = to_onnx(
+                flattened(it),
+                list(it.inputs.values()),
+                model_name=f"gacrl {source.opened.config.task}",
+                opset=OPSET,
+                input_names=list(it.inputs),
+                output_names=list(it.outputs),
+            )
     except Exception as error:  # a dozen kinds, one for each primitive
         why = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(f"jax2onnx cannot convert the policy of {source.name} ({why}): take stablehlo") from error
     return model.SerializeToString()
+
+
+@contextlib.contextmanager
+def _jax_as_it_is() -> Generator[None]:
+    """Put back what jax2onnx puts in the place of JAX's public functions, and leaves there: `jnp.cumsum` for one."""
+    public = [
+        module for name, module in sys.modules.items() if name.split(".")[0] == "jax" and "._src" not in name
+    ]
+    before = [(module, name, it) for module in public for name, it in vars(module).items() if callable(it)]
+    try:
+        yield
+    finally:
+        for module, name, it in before:
+            if vars(module).get(name) is not it:
+                setattr(module, name, it)
 
 
 def runner(data: bytes) -> Callable[[Arrays], Arrays]:
