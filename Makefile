@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak cluster plain-path lint types bench bench-short lock clean
+.PHONY: train test soak cluster plain-path lint types bench bench-short release lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
@@ -36,6 +36,9 @@ bench: $(STAMP)  ## side by side with peers, in environments of their own; fails
 
 bench-short: $(STAMP)  ## compiled programs have not grown
 	"$(BIN)/python" benchmarks/guard.py --short
+
+release:  ## wheel and sdist, each tried in a fresh environment from another folder; missing Pythons are skipped
+	"$(PYTHON)" .ci/release.py $(LEGS)
 
 lock:  ## pin what CI installs anew: the newest of everything that pyproject.toml allows
 	"$(PYTHON)" -m venv .venv-lock

@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -163,8 +164,9 @@ def test_onnx_decides_as_the_run(name: str, tmp_path: Path):
     """The second one has axes of length 0: its agents see nobody."""
     pytest.importorskip("jax2onnx", reason="pip install 'gacrl[onnx]'")
     onnxruntime = pytest.importorskip("onnxruntime", reason="pip install 'gacrl[onnx]'")
-    out = tmp_path / "policy.onnx"
+    out, before = tmp_path / "policy.onnx", dict(vars(jax.numpy))
     formats.writer("onnx")(Source(f"pretrained:{name}"), out)
+    assert not [name for name, it in before.items() if vars(jax.numpy)[name] is not it], "JAX is as it was"
     card = (tmp_path / "policy.onnx.md").read_text()
     assert "It repeats 1,000 of 1,000" in card and "Opset 21" in card
     session = onnxruntime.InferenceSession(out.read_bytes(), providers=["CPUExecutionProvider"])
@@ -196,6 +198,9 @@ def test_metrics_as_a_table(tiny_run: TinyRun, tmp_path: Path, said: Callable[..
 def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[int, str]], monkeypatch: Any):
     out, run = tmp_path / "policy.npz", tiny_run.folder
     (tmp_path / "there.npz").touch()
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run, damaged)
+    (damaged / "summary.json").write_text("{")
     for words, sentence in (
         ((run,), "say where with --out FILE"),
         ((run, "--out", tmp_path / "policy"), "does not say which format"),
@@ -206,6 +211,7 @@ def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[
         ((run, "--out", out, "--num-agent", 4), "did you mean --num-agents?"),
         ((f"{run}@7", "--out", out), "there is no @7"),
         (("oracle", "--out", out), "oracle is a script"),
+        ((damaged, "--out", out), "summary.json is damaged"),
         (("pretrained:gacrl", "--out", tmp_path / "x.csv"), "has no metrics.jsonl with an evaluation in it"),
     ):
         code, told = said("export", *words)
@@ -214,4 +220,4 @@ def test_sentences(tiny_run: TinyRun, tmp_path: Path, said: Callable[..., tuple[
     for name in ("onnx", "stablehlo"):
         code, told = said("export", run, "--out", tmp_path / f"x.{name}")
         assert code == 2 and "pip install 'gacrl[onnx]'" in told, told
-    assert sorted(tmp_path.iterdir()) == [tmp_path / "there.npz"], "nothing is left of what failed"
+    assert sorted(tmp_path.iterdir()) == [damaged, tmp_path / "there.npz"], "nothing is left of what failed"

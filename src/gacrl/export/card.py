@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gacrl.config import files as configuration
+from gacrl.errors import UserError
 from gacrl.export import card_of
 from gacrl.export.program import Program
 from gacrl.export.source import Source
@@ -34,7 +35,7 @@ def card(source: Source, program: Program, file: str, checked: str = "") -> str:
         "Tensors": _table(("name", "shape"), [(f"`{n}`", str(list(w.shape))) for n, w in program.weights.items()]),
         "Task": _block(settings["env"]),
         "What it reaches": _reached(source),
-        "Made by": _table(("what", "version"), list(made_by(source).items())),
+        "Made by": _table(("what", "version"), list(_made_by(source).items())),
     }
     first, *rest = sections.items()
     body = "\n".join(f"\n## {head}\n\n{text}" for head, text in rest)
@@ -65,11 +66,11 @@ def _signature(program: Program) -> str:
 
 def _reached(source: Source) -> str:
     """The closing evaluation, mean over the seeds of the run, where the run has one."""
-    folder = source.folder
-    if not folder.summary_file.is_file():
+    summary = _summary_of(source)
+    if not summary:
         return "No closing evaluation lies beside this run: `gacrl evaluate` makes one."
-    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
-    rows = [(name, f"{value['mean']:.4g}") for name, value in summary["final"]["greedy"].items()]
+    means = {name: value["mean"] for name, value in summary["final"]["greedy"].items()}
+    rows = [(name, "" if mean is None else f"{mean:.4g}") for name, mean in means.items()]
     seeds = ", ".join(map(str, summary["seeds"]))
     return (
         f"Greedy, {summary['episodes']} episodes of {summary['horizon']} steps, mean over the seeds {seeds}.\n\n"
@@ -77,18 +78,26 @@ def _reached(source: Source) -> str:
     )
 
 
-def made_by(source: Source) -> dict[str, str]:
+def _made_by(source: Source) -> dict[str, str]:
     """Return the versions that trained the run where it says so, and those of this export."""
-    folder = source.folder
-    trained: dict[str, str] = {}
-    if folder.summary_file.is_file():
-        trained = json.loads(folder.summary_file.read_text(encoding="utf-8"))["versions"]
-    now = versions()
+    trained, now = _summary_of(source).get("versions", {}), versions()
     return {
         **{f"trained with {name}": number for name, number in trained.items()},
         "exported with gacrl": version(),
         "exported at commit": now.get("git_commit", "of a release"),
     }
+
+
+def _summary_of(source: Source) -> dict[str, Any]:
+    """Return the run's closing summary; {} where there is none. Raises UserError for a damaged one."""
+    file = source.folder.summary_file
+    if not file.is_file():
+        return {}
+    try:
+        summary = json.loads(file.read_text(encoding="utf-8"))
+        return {**summary, "final": {**summary["final"]}}
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{file} is damaged ({error}): move it away, and the card goes without it") from error
 
 
 def _table(columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:

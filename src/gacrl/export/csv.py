@@ -1,10 +1,12 @@
 """The numbers of a run as a table: every evaluation of every seed is a row."""
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
+from gacrl.evaluation.episodes import written_whole
 from gacrl.export.source import Source
 from gacrl.training.trackers.rows import flat
 
@@ -19,7 +21,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     if not rows:
         raise UserError(f"{source.name} has no metrics.jsonl with an evaluation in it: train first")
     columns = dict.fromkeys(name for row in rows for name in row)
-    with out.open("w", encoding="utf-8", newline="") as file:
+    with written_whole(out) as binary, io.TextIOWrapper(binary, encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, columns, lineterminator="\n")
         table.writeheader()
         table.writerows(rows)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import program
 from gacrl.export.source import Source
@@ -13,6 +14,7 @@ from gacrl.export.source import Source
 def write(source: Source, out: Path) -> Sequence[Path]:
     """Write the weights that act, by name, and their card. No array in it is an object: nothing is pickled."""
     it = program(source)
-    with out.open("wb") as file:
-        np.savez(file, **it.weights)
-    return [out, write_card(source, it, out)]
+    card = write_card(source, it, out)
+    with written_whole(out) as file:
+        np.savez(file, allow_pickle=False, **it.weights)
+    return [out, card]

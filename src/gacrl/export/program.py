@@ -95,10 +95,12 @@ def flattened(it: Program) -> Callable[..., list[Array]]:
 
 def _stepped(closed: core.ClosedJaxpr, step: core.JaxprEqn, known: dict[Any, Any]) -> list[Any]:
     """Return what a step of a program makes of the arrays so far: NumPy's where it needs no input for it."""
-    if all(var.aval.size == 0 for var in step.outvars):
-        return [np.zeros(var.aval.shape, var.aval.dtype) for var in step.outvars]
+    makes: list[Any] = [var.aval for var in step.outvars]
+    if all(array.size == 0 for array in makes):
+        return [np.zeros(array.shape, array.dtype) for array in makes]
     if step.primitive.name == "concatenate":
-        step = step.replace(invars=[var for var in step.invars if var.aval.size])
+        takes: list[Any] = [var.aval for var in step.invars]
+        step = step.replace(invars=[var for var, array in zip(step.invars, takes, strict=True) if array.size])
     needed = list(dict.fromkeys(var for var in step.invars if isinstance(var, core.Var)))
     alone = closed.jaxpr.replace(constvars=(), invars=needed, outvars=step.outvars, eqns=[step])
     given = [known[var] for var in needed]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import safetensors.numpy
 
+from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import program
 from gacrl.export.source import Source
@@ -15,5 +16,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     """Write the weights that act, by name, and their card; the file's metadata say what it is of."""
     it, run = program(source), source.opened
     about = {"format": "gacrl", "gacrl": version(), "task": run.config.task, "preset": run.config.preset}
-    safetensors.numpy.save_file(it.weights, str(out), metadata=about)
-    return [out, write_card(source, it, out)]
+    card = write_card(source, it, out)
+    with written_whole(out) as file:
+        file.write(safetensors.numpy.save(it.weights, metadata=about))
+    return [out, card]

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jax import export
 
+from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import flattened, program
 from gacrl.export.recorded import Arrays, compared
@@ -31,5 +32,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
         return {name: np.asarray(array) for name, array in zip(it.outputs, found, strict=True)}
 
     checked = compared(source, it, run)
-    out.write_bytes(data)
-    return [out, write_card(source, it, out, f"{checked} Platforms: {', '.join(PLATFORMS)}.")]
+    card = write_card(source, it, out, f"{checked} Platforms: {', '.join(PLATFORMS)}.")
+    with written_whole(out) as file:
+        file.write(data)
+    return [out, card]

@@ -16,10 +16,10 @@ FOLDER = "tensorboard"
 def begin(folder: RunFolder, config: RunConfig, name: str) -> Sink:
     """Write into `tensorboard/` of the run folder; `tensorboard --logdir runs` shows all runs side by side."""
     from PIL import Image
-    from tensorboard.compat.proto.event_pb2 import Event
-    from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
-    from tensorboard.compat.proto.tensor_pb2 import TensorProto
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+    from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
+    from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata  # pyright: ignore[reportMissingImports]
+    from tensorboard.compat.proto.tensor_pb2 import TensorProto  # pyright: ignore[reportMissingImports]
+    from tensorboard.summary.writer.event_file_writer import EventFileWriter  # pyright: ignore[reportMissingImports]
 
     writer = EventFileWriter(str(folder.path / FOLDER))
 
