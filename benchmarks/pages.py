@@ -1,6 +1,6 @@
 """Write the pages of docs/pages: every policy that comes with the package, as `gacrl export` writes it.
 
-    python benchmarks/pages.py
+python benchmarks/pages.py
 """
 
 from pathlib import Path

@@ -26,6 +26,7 @@ from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
     from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume
+    from gacrl.experiments.scoring import Recorded
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
     from gacrl.types import Intervention
@@ -376,16 +377,28 @@ def _render(words: Words) -> int:
     out = asked.out.absolute()  # a task may change the folder of the process
     film.require_format(out)
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
+    film.require_rows(out, asked.episodes, asked.beside)
     happens = _intervention(asked.messages)
-    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
+
+    def record(intervention: "Intervention | None") -> tuple["Recorded", str]:
+        shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, intervention)
+        return shown, "" if shown.intervention is None else shown.intervention.told
+
+    shown, told = record(None if asked.beside else happens)
     if shown.episodes[0].scene is None:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )
-    told = "" if shown.intervention is None else shown.intervention.told
-    title = f"{told}: {asked.run}" if told else asked.run
-    film.write(shown.episodes, out, size=asked.size, title=title, words=shown.task.words)
-    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}" + (f"; {told}" if told else ""))
+    title, beside, also = f"{told}: {asked.run}" if told else asked.run, None, ""
+    if asked.beside:
+        from gacrl.messages.interventions import silence
+        from gacrl.render import Beside
+
+        other, also = record(silence() if happens is None else happens)
+        beside = Beside(other.episodes, f"{also}: {asked.run}")
+    film.write(shown.episodes, out, asked.size, title, shown.task.words, beside)
+    notes = "".join(f"; {note}" for note in (told, f"beside them {also}" if also else "") if note)
+    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}{notes}")
     return 0
 
 
