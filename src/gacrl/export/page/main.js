@@ -160,7 +160,8 @@ const act = {
   },
   copy() {
     write();
-    navigator.clipboard?.writeText(location.href).then(() => say(byId("copied"), "copied"), () => say(byId("copied"), "copy it from the address bar"));
+    const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
+    copied.then(() => say(byId("copied"), "copied"), () => say(byId("copied"), "copy it from the address bar"));
   },
 };
 
