@@ -2,15 +2,18 @@
 
     python benchmarks/ship.py runs/gacrl gacrl --seed 0
     gacrl evaluate pretrained:gacrl
+    python benchmarks/ship.py docs/data/gacrl-10-seeds.json gacrl     # its card alone, anew from a summary
 
-Writes src/gacrl/pretrained/NAME anew.
+Writes src/gacrl/pretrained/NAME anew, with a card: whose seed it is, of which table, and what it scores.
 """
 
 import argparse
+import hashlib
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -28,19 +31,45 @@ def main() -> None:
     parser.add_argument("name")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    config = files.load(asked.run / "config.json")
-    found, warnings = checkpoint.newest(asked.run / "checkpoints")
+    if asked.run.suffix != ".json":
+        _ship(asked.run, asked.name, asked.seed)
+    summary = asked.run if asked.run.suffix == ".json" else asked.run / "summary.json"
+    _write_card(SHIPPED / asked.name, json.loads(summary.read_text(encoding="utf-8")), asked.seed)
+
+
+def _ship(run: Path, name: str, seed: int) -> None:
+    config = files.load(run / "config.json")
+    found, warnings = checkpoint.newest(run / "checkpoints")
     assert not warnings, warnings
     learners = session.load_learners(found, build.make_trainer(config))
-    at = config.seeds.index(asked.seed)
+    at = config.seeds.index(seed)
     learner = jax.tree.map(lambda leaf: leaf[at : at + 1], learners)
-    alone = replace(config, seed=asked.seed, num_seeds=1)
-    folder = SHIPPED / asked.name
+    alone = replace(config, seed=seed, num_seeds=1)
+    folder = SHIPPED / name
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(files.to_dict(alone), indent=2) + "\n", encoding="utf-8")
     tensors = checkpoint.serialise(checkpoint.arrays(Acting(learner)))
     print(checkpoint.save(folder / "checkpoints", tensors, found.env_steps, files.fingerprint(alone), {}))
+
+
+def _write_card(folder: Path, summary: dict[str, Any], seed: int) -> None:
+    """What the policy is, whence it comes and what it scores, for whoever finds the file alone."""
+    (tensors,) = folder.glob("checkpoints/*/state.safetensors")
+    at = summary["seeds"].index(seed)
+    final = {metric: entry["values"][at] for metric, entry in summary["final"]["greedy"].items()}
+    card = {
+        "preset": summary["preset"],
+        "task": summary["task"]["name"],
+        "seed": seed,
+        "of_seeds": summary["seeds"],
+        "env_steps": summary["env_steps"],
+        "episodes": summary["episodes"],
+        "greedy": {metric: value for metric, value in final.items() if not metric.startswith("score_")},
+        "versions": summary["versions"],
+        "sha256": hashlib.sha256(tensors.read_bytes()).hexdigest(),
+    }
+    (folder / "card.json").write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

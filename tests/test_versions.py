@@ -41,6 +41,9 @@ def test_only_our_own_repository_is_noted(tmp_path: Path, monkeypatch: pytest.Mo
     (unpacked.parents[1] / "pyproject.toml").write_text(OURS)
 
     assert git_commit(clone / "src" / "gacrl") == commit
+    (clone / "src" / "gacrl" / "new.py").write_text("x = 1\n")
+    assert git_commit(clone / "src" / "gacrl") == f"{commit}-dirty"
+    (clone / "src" / "gacrl" / "new.py").unlink()
     for package in (installed, unpacked, theirs / "src" / "gacrl", Path("/gacrl")):
         assert git_commit(package) is None
     monkeypatch.setenv("GIT_DIR", str(theirs / ".git"))  # as in a hook of theirs

@@ -1,6 +1,6 @@
 """The functions of `import gacrl`: train, evaluate, and the loop in one's own hands."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,11 +20,12 @@ from gacrl.evaluation.summary import Estimate, estimated
 from gacrl.experiments import scoring
 from gacrl.messages import interventions
 from gacrl.tasks import own
-from gacrl.training import build, loop, session
+from gacrl.training import build, loop, session, trackers
 from gacrl.training.devices import prepare_jax
 from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
 from gacrl.training.telling import teller
+from gacrl.training.trackers.following import tracked
 from gacrl.training.trainer import ChunkReport, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.types import Arrives, Intervention, PRNGKey
@@ -76,14 +77,15 @@ def train(
     env: Any = None,
     begin_from: "str | Path | Run | None" = None,
     quiet: bool = False,
+    track: str | Sequence[str] = (),
 ) -> Run:
     """Train into a new run folder and return the finished run.
 
     config: settings, or the name of a preset; the default preset where none is given. seed: replaces the
     configuration's. out: the run folder, by default the next free one under `runs/`. watcher: hears of it, beside the
     lines that are printed unless `quiet`. env: a task's name, `FILE.py:NAME`, a `Task`, an `Environment` (its class or
-    an instance); by default the configuration's. begin_from: a run whose policy this one starts with. Raises UserError
-    (ConfigError for settings) with one sentence.
+    an instance); by default the configuration's. begin_from: a run whose policy this one starts with. track: trackers
+    by name, "csv,tensorboard". Raises UserError (ConfigError for settings) with one sentence.
     """
     require_kind(
         "watcher", watcher, (Watcher, type(None)), "a gacrl.Watcher, such as gacrl.Watcher(progress=print)"
@@ -91,9 +93,9 @@ def train(
     require_kind("out", out, (str, Path, type(None)), "the path of a new folder")
     config = settled(config, seed, env)
     watching = (Watcher() if quiet else teller(config)) + (watcher or Watcher())
-    with own.blamed(_source(config)):
+    with own.blamed(_source(config)), tracked(trackers.chosen(track), watching.warn) as tracking:
         parent = None if begin_from is None else play.parent(play.name_of(begin_from))
-        ended = session.start(config, None if out is None else Path(out), watching, parent)
+        ended = session.start(config, None if out is None else Path(out), watching + tracking, parent)
     return Run(ended.folder, ended.config, ended.env_steps, ended.summary)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gacrl import tasks
 from gacrl.cli.main import main
 from gacrl.config import files as configuration
 from gacrl.config import presets
@@ -15,6 +16,7 @@ from gacrl.config.run import RunConfig
 from gacrl.experiments import ablate
 from gacrl.experiments.ablate import FULL, YOKED, parts_of, plan
 from gacrl.experiments.study import Planned
+from gacrl.experiments.worth import remarkable, worths
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.tasks.task import HEADLINE
 from gacrl.training import session
@@ -117,9 +119,14 @@ def test_the_command_says_what_each_part_is_worth(
     assert list(runs) == [FULL, *parts]
     assert runs[FULL]["probability_that_the_part_helps"] is None
     worth = runs["no-messages"]["probability_that_the_part_helps"]
-    assert set(worth) >= {SCORE, "coverage_final_0.1", "collisions"}, "every metric of the tables"
+    assert set(worth) >= {SCORE, "coverage_final_0.1", "collisions"}, "every metric of the task"
+    assert len(worth) == len(METRICS)
     assert worth[SCORE] == [1.0, 1.0, 1.0] and worth["collisions"] == [0.0, 0.0, 0.0], "fewer are better"
     assert runs["no-symmetry"]["probability_that_the_part_helps"][SCORE][0] == 0.0
+    assert runs["no-messages"]["with_it_less_without"][SCORE] == pytest.approx([0.2, 0.199, 0.201], abs=1e-3)
+    said = runs["no-messages"]["said"]
+    assert (said[SCORE], said["collisions"]) == ("may help", "may cost"), "three seeds claim nothing"
+    assert runs["no-coverage-bonus"]["said"] == {}
     assert runs["no-coverage-bonus"]["diverged"] == "seed 0 diverged: loss is nan"
     assert runs["no-messages"]["intervals"][SCORE][0] == pytest.approx(0.701)
 
@@ -131,6 +138,7 @@ def test_the_command_says_what_each_part_is_worth(
     page = Path(answer["report"]).read_text(encoding="utf-8")
     assert "diverged: seed 0 diverged" in page
     assert "0.701 [0.700, 0.702]" in page
+    assert "<td>no-messages</td><td>may cost</td><td>collisions</td><td>0.200 [0.199, 0.201]" in page
     assert page.count("<figure>") == 4
     assert (
         "gacrl ablate --preset gacrl-112k --seeds 3 --seed 0 --env-steps 112500 --updates 5 --part no-messages"
@@ -143,6 +151,18 @@ def test_the_command_says_what_each_part_is_worth(
     assert len(trained) == before, "nothing is trained twice"
     assert main(["ablate", "--seeds", "4", "--out", str(out)]) == 2
     assert "holds another ablation" in capsys.readouterr().err
+
+
+def test_ten_seeds_may_claim():
+    """Seeds that differ in every pair; by as much, but in most pairs only; and no more than by chance."""
+    task, seeds = tasks.find("spread"), np.arange(10.0)
+    whole = dict.fromkeys(("return_agent_mean", "collisions", "reward_raw"), seeds)
+    without = {"return_agent_mean": seeds - 10.0, "collisions": seeds - 10.0, "reward_raw": seeds - 0.5}
+    found = worths(task, whole, without)
+    assert [found[metric].said for metric in whole] == ["helps", "costs", ""]
+    assert list(remarkable(found)) == ["return_agent_mean", "collisions"]
+    fewer = worths(task, {m: v[:9] for m, v in whole.items()}, {m: v[:9] for m, v in without.items()})
+    assert [fewer[metric].said for metric in whole] == ["may help", "may cost", ""]
 
 
 def test_there_is_nothing_to_compare_with_where_the_whole_diverges(

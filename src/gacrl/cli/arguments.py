@@ -109,6 +109,7 @@ class Train:
       gacrl train --config my.json --seed 7           `gacrl config` prints such a file
       gacrl train --env examples/own_task.py:Beacon --env.places 7    a task of your own
       gacrl train --from runs/gacrl-1                 start with the policy of a run
+      gacrl train --track tensorboard,trackio         pip install 'gacrl[track]'
     """
 
     settings: Annotated[Settings, tyro.conf.arg(name="")]
@@ -123,6 +124,8 @@ class Train:
     """The same, counted in episodes."""
     out: Path | None = None
     """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
+    track: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
+    """Also write every evaluation elsewhere: csv, tensorboard, trackio, wandb, or several with commas."""
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -145,6 +148,8 @@ class Resume:
     diagnose: bool = False
     """Write nothing, but play on from the newest checkpoint, and print the first update that is not finite."""
     outside: ON_TASK = Outside()
+    track: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
+    """Also write every evaluation elsewhere: csv, tensorboard, trackio, wandb, or several with commas."""
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""

@@ -25,7 +25,7 @@ from gacrl.errors import UserError, full_memory, reason
 from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
-    from gacrl.cli.arguments import Cluster, Evaluate, Messages, Render, Resume
+    from gacrl.cli.arguments import Evaluate, Messages, Render, Resume, Train
     from gacrl.experiments.scoring import Recorded
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
@@ -39,8 +39,8 @@ usage: gacrl COMMAND [OPTIONS]
   train      train a preset or your own settings into a new run folder
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
-  render     watch a run, random, noop or oracle: a GIF or MP4
-  export     take a run elsewhere: weights, a program, its numbers
+  render     watch a run, random, noop or oracle: a GIF, MP4 or strip of pictures
+  export     take a run elsewhere: weights, a program, a page to play with, its numbers
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
@@ -185,7 +185,7 @@ def _train(words: Words) -> int:
         parent = None if asked.begin_from is None else play.parent(asked.begin_from, watcher.warn)
         return session.start(config, asked.out, watcher, parent)
 
-    return _watched(start, asked.json, config, asked.cluster)
+    return _watched(start, asked, config)
 
 
 @contextlib.contextmanager
@@ -223,7 +223,7 @@ def _resume(words: list[str]) -> int:
 
         return session.resume(asked.run, asked.extend, watcher)
 
-    return _watched(resume, asked.json, config, asked.cluster)
+    return _watched(resume, asked, config)
 
 
 def _diagnose(asked: "Resume") -> int:
@@ -245,11 +245,16 @@ def _diagnose(asked: "Resume") -> int:
     return 0
 
 
-def _watched(work: Callable[["Watcher"], "Ended"], as_json: bool, config: RunConfig, cluster: "Cluster") -> int:
+def _watched(work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", config: RunConfig) -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
+    cluster = asked.cluster
     cluster.check()
+    from gacrl.training import trackers
+
+    track = trackers.chosen(asked.track)
     from gacrl.cli.terminal import TerminalWatcher
     from gacrl.training import devices, distributed
+    from gacrl.training.trackers.following import tracked
 
     place = distributed.ALONE
     if cluster.distributed:
@@ -259,10 +264,11 @@ def _watched(work: Callable[["Watcher"], "Ended"], as_json: bool, config: RunCon
         TerminalWatcher(quiet=place.process > 0) as terminal,
         stopping(terminal),
         distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
+        tracked(() if terminal.quiet else track, watcher.warn) as tracking,
     ):
-        run = work(watcher)
+        run = work(watcher + tracking)
     terminal.report(run)
-    if as_json and not terminal.quiet:
+    if asked.json and not terminal.quiet:
         print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
     return 0 if run.summary is not None else terminal.exit_code
 

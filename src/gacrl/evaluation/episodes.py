@@ -186,7 +186,7 @@ def recorded_bytes(env: Environment, params: EnvParams, num_episodes: int, look:
     return int(env.max_cycles) * num_episodes * (shown + acted + heard + single * agents)
 
 
-class _Played(NamedTuple):
+class Played(NamedTuple):
     """Up to the time limit, episodes side by side; what follows `done` belongs to the next episode."""
 
     scene: Scene | None
@@ -215,34 +215,53 @@ def record_many(
     """
 
     @jax.jit
-    def play(memory: Memory, params: EnvParams, key: PRNGKey) -> _Played:
-        def one_step(
-            carry: rollout.Carry, key: PRNGKey
-        ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
-            keys = jax.random.split(key, (num_episodes, 3))
-            after, step = rollout.act(env, policy, params, carry, keys, intervention)
-            seen = _view(look, after.env_state, step.next_observation, params)
-            return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
+    def program(memory: Memory, params: EnvParams, key: PRNGKey) -> Played:
+        return play(env, policy, memory, params, key, num_episodes, intervention, look)
 
-        start_key, act_key = jax.random.split(key)
-        carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
-        opening = _view(look, carry.env_state, carry.observation, params)
-        _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
-        scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
-        return _Played(
-            scene=scene,
-            actions=steps.decision.action,
-            messages=steps.decision.messages,
-            adjacency=steps.decision.adjacency,
-            reward=steps.reward,
-            reward_raw=steps.info["reward_raw"],
-            done=done,
-            agent_mask=steps.observation.agent_mask,
-        )
+    return cut(program(initial_memory, params, typed_keys(key)))
 
-    played = jax.device_get(play(initial_memory, params, typed_keys(key)))
 
-    return [_episode(played, k) for k in range(num_episodes)]
+def play(
+    env: Environment,
+    policy: Policy,
+    memory: Memory,
+    params: EnvParams,
+    key: PRNGKey,
+    num_episodes: int,
+    intervention: Intervention | None = None,
+    look: Look | None = None,
+) -> Played:
+    """What `record_many` compiles: K environments from their start to the time limit."""
+
+    def one_step(
+        carry: rollout.Carry, key: PRNGKey
+    ) -> tuple[rollout.Carry, tuple[Transition, Array, Scene | None]]:
+        keys = jax.random.split(key, (num_episodes, 3))
+        after, step = rollout.act(env, policy, params, carry, keys, intervention)
+        seen = _view(look, after.env_state, step.next_observation, params)
+        return rollout.renew(env, memory, params, after, step.left, keys), (step, after.first, seen)
+
+    start_key, act_key = jax.random.split(key)
+    carry = rollout.start(env, params, memory, start_key, num_episodes, intervention, policy)
+    opening = _view(look, carry.env_state, carry.observation, params)
+    _, (steps, done, seen) = jax.lax.scan(one_step, carry, jax.random.split(act_key, env.max_cycles))
+    scene = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), opening, seen)
+    return Played(
+        scene=scene,
+        actions=steps.decision.action,
+        messages=steps.decision.messages,
+        adjacency=steps.decision.adjacency,
+        reward=steps.reward,
+        reward_raw=steps.info["reward_raw"],
+        done=done,
+        agent_mask=steps.observation.agent_mask,
+    )
+
+
+def cut(played: Played) -> list[Episode]:
+    """Return what was played side by side as episodes, each up to its end."""
+    played = jax.device_get(played)
+    return [_episode(played, k) for k in range(played.done.shape[1])]
 
 
 def _view(look: Look | None, state: EnvState, observation: Observation, params: EnvParams) -> Scene | None:
@@ -256,7 +275,7 @@ def _view(look: Look | None, state: EnvState, observation: Observation, params: 
     )
 
 
-def _episode(played: _Played, k: int) -> Episode:
+def _episode(played: Played, k: int) -> Episode:
     """Cut the k-th of the episodes that were played side by side, up to its end."""
     steps = int(played.done[:, k].argmax()) + 1  # the time limit ends what nothing else has ended
 

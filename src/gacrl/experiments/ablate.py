@@ -22,10 +22,7 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.statistics import (
     Curve,
-    Estimate,
-    detectable,
     estimate,
-    probability_of_improvement,
     sample_efficiency,
     with_interval,
 )
@@ -38,6 +35,7 @@ from gacrl.experiments.study import (
     train_missing,
     why_diverged,
 )
+from gacrl.experiments.worth import CLAIMED_FROM, remarkable, worths
 from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
@@ -233,8 +231,9 @@ def _read_outcome(run: Planned) -> Outcome:
         name=run.name,
         parameters=_num_parameters(run.config),
         final={
-            metric: np.array(summary["final"]["greedy"][metric]["values"])
-            for metric in task.shown(list(summary["final"]["greedy"]))
+            metric: np.array(entry["values"])
+            for metric, entry in summary["final"]["greedy"].items()
+            if not metric.startswith("score_")
         },
         evaluated_at=steps,
         along=np.array([[row["greedy"][task.headline] for row in seed] for seed in by_seed]),
@@ -244,32 +243,26 @@ def _read_outcome(run: Planned) -> Outcome:
 
 def _data(task: Task, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     full = outcomes[0]
-    return {
-        "runs": [
+    runs: list[dict[str, Any]] = []
+    for outcome in outcomes:
+        found = {} if outcome is full else worths(task, full.final, outcome.final)
+        runs.append(
             {
                 "name": outcome.name,
                 "parameters": outcome.parameters,
                 "diverged": outcome.diverged,
                 "final": {metric: values.tolist() for metric, values in outcome.final.items()},
                 "intervals": {metric: list(estimate(values)) for metric, values in outcome.final.items()},
-                "probability_that_the_part_helps": (
-                    None if outcome is full else {m: _worth(task, m, full, outcome) for m in full.final}
-                ),
+                "probability_that_the_part_helps": {m: list(worth.probability) for m, worth in found.items()}
+                or None,
+                "with_it_less_without": {m: list(worth.difference[:3]) for m, worth in found.items()} or None,
+                "said": {m: worth.said for m, worth in remarkable(found).items()},
                 "env_steps": list(outcome.evaluated_at),
                 "along": outcome.along.tolist(),
                 "epsilon": outcome.epsilon.tolist(),
             }
-            for outcome in outcomes
-        ]
-    }
-
-
-def _worth(task: Task, metric: str, full: Outcome, without: Outcome) -> Estimate | None:
-    """P(a seed with all parts does better in this metric than one without this part), and its interval."""
-    if without is full or not full.final or not without.final:
-        return None
-    sign = 1.0 if task.metric(metric).higher_is_better else -1.0
-    return probability_of_improvement(sign * full.final[metric], sign * without.final[metric])
+        )
+    return {"runs": runs}
 
 
 def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome]) -> Path:
@@ -286,7 +279,7 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
         "does not act, is left out of that count."
     )
     _results(page, task, config, outcomes)
-    _worths(page, task, outcomes)
+    _what_parts_are_worth(page, task, outcomes)
     ended = [outcome for outcome in outcomes if outcome.diverged is None]
     page.figure(
         figures.dots(
@@ -334,34 +327,48 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
 
 def _results(page: Page, task: Task, config: RunConfig, outcomes: Sequence[Outcome]) -> None:
     """What each of the runs reached."""
+    shown = task.shown(list(outcomes[0].final))
     rows: list[list[str]] = []
     for outcome in outcomes:
         known = parts_of(config)
         says = known[outcome.name].says if outcome.name in known else "nothing taken away"
         if outcome.diverged is not None:
-            cells = [f"diverged: {outcome.diverged}", *[""] * (len(outcomes[0].final) - 1)]
+            cells = [f"diverged: {outcome.diverged}", *[""] * (len(shown) - 1)]
         else:
-            cells = [with_interval(estimate(values)) for values in outcome.final.values()]
+            cells = [with_interval(estimate(outcome.final[metric])) for metric in shown]
         rows.append([outcome.name, says, f"{outcome.parameters:,}", *cells])
-    page.table(("", "what it is", "parameters", *outcomes[0].final), rows)
+    page.table(("", "what it is", "parameters", *shown), rows)
 
 
-def _worths(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
-    """What each part is worth, by every metric."""
-    rows: list[list[str]] = []
-    for outcome in outcomes[1:]:
-        worths = [_worth(task, metric, outcomes[0], outcome) for metric in outcomes[0].final]
-        if None not in worths:
-            cells = [with_interval(worth, ".2f") for worth in worths if worth is not None]
-            apart = detectable(outcomes[0].final[task.headline], outcome.final[task.headline])
-            rows.append([outcome.name, *cells, f"{apart:.3f}"])
-    page.heading("The probability that a part helps")
-    page.table(("without", *outcomes[0].final, f"detectable {task.headline}"), rows)
+def _what_parts_are_worth(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
+    """What may be said of each part in any metric, and the probabilities in those of the tables."""
+    full = outcomes[0]
+    shown = task.shown(list(full.final))
+    found = {o.name: worths(task, full.final, o.final) for o in outcomes[1:] if o.diverged is None}
+    page.heading("What each part does")
+    rows = [
+        [name, worth.said, metric, with_interval(worth.difference), with_interval(worth.probability, ".2f")]
+        for name, by_metric in found.items()
+        for metric, worth in remarkable(by_metric).items()
+    ]
+    if rows:
+        page.table(("part", "it", "in", "with it less without", "probability that it helps"), rows)
     page.text(
-        "The probability that a seed with all parts ends with a better value than one without this one. One may say "
-        "that a part helps where it is .95 or more, its interval lies above .5, and there are 10 seeds; fewer "
-        f"indicate. Detectable: the smallest difference of mean {task.headline} that so many seeds would show in 80 % "
-        "of all repetitions."
+        f"All {len(full.final)} metrics of the task are judged, for better and for worse. A part helps where a seed "
+        "with it ends better than one without in .95 or more of all pairs and the interval lies above .5; where it is "
+        f"the other way round, it costs. That is claimed from {CLAIMED_FROM} seeds on; with fewer it says what may be. "
+        "Of so many comparisons a few come out by chance."
+        + ("" if rows else " Here nothing may be said of any part.")
+    )
+    page.heading("The probability that a part helps")
+    rows = []
+    for name, by_metric in found.items():
+        cells = [with_interval(by_metric[metric].probability, ".2f") for metric in shown]
+        rows.append([name, *cells, f"{by_metric[task.headline].difference.detectable:.3f}"])
+    page.table(("without", *shown, f"detectable {task.headline}"), rows)
+    page.text(
+        "The probability that a seed with all parts ends with a better value than one without this one. Detectable: "
+        f"the smallest difference of mean {task.headline} that so many seeds would show in 80 % of all repetitions."
     )
 
 

@@ -72,6 +72,7 @@ def make_trainer(
         mesh=mesh(config, algorithm) if devices is None else devices,
         for_speed=algorithm.compiled_for_speed,
         watched=tasks.brought(config.task) is not None,
+        look=look_of(task, evaluated),
         intervention=interventions.parse(config.training.intervention) if intervention is None else intervention,
     )
 
@@ -136,9 +137,9 @@ def member_shapes(trainer: Trainer) -> TrainState:
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
 
 
-def stacked_shapes(trainer: Trainer) -> TrainState:
-    """The shapes of the training state of all seeds, as a checkpoint holds it."""
-    return _stacked(member_shapes(trainer), trainer.num_seeds)
+def stacked_shapes(trainer: Trainer, num_seeds: int | None = None) -> TrainState:
+    """The shapes of the training state of all seeds, as a checkpoint holds it; or of so many."""
+    return _stacked(member_shapes(trainer), trainer.num_seeds if num_seeds is None else num_seeds)
 
 
 def learner_shapes(trainer: Trainer) -> Learner:

@@ -1,20 +1,16 @@
 """How much longer a run will take, judged by how long its parts have taken so far."""
 
-_COMPILATIONS = 3.5
-"""What follows the last chunk is made of programs of its own: evaluations, policies that learn nothing, episodes to
-look at. Compiling them took 2 to 5 times as long as the two evaluations along the way did, the less the more was kept
-from before (`gacrl`, `ippo`, `paper`)."""
 _SECONDS_A_FRAME = 0.006
 """Of a picture that is 480 pixels wide, on one core."""
 
 
-def closing_seconds(compiling: float, playing: float, more_episodes: float, frames: int) -> float:
-    """What is still to come after the last chunk.
+def closing_seconds(playing: float, more_episodes: float, frames: int) -> float:
+    """What is still to come after the last chunk; its programs are compiled by then.
 
-    compiling, playing: seconds that the evaluations along the way took to compile, and take to play. more_episodes: how
-    many times as many the closing evaluations have. frames: of all pictures.
+    playing: seconds that the evaluations along the way take. more_episodes: how many times as many the closing
+    evaluations have. frames: of all pictures.
     """
-    return _COMPILATIONS * compiling + more_episodes * playing + _SECONDS_A_FRAME * frames
+    return more_episodes * playing + _SECONDS_A_FRAME * frames
 
 
 def seconds_left(

@@ -4,7 +4,7 @@ Whoever watches (command line, recorder, trackers, viewer, sweep) reads the one 
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.metrics import EpisodeSummary
 from gacrl.render import num_frames
+from gacrl.training.ahead import Ahead, Programs, prepare
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task
 from gacrl.training.forecast import closing_seconds, seconds_left
@@ -30,6 +31,7 @@ class Clock:
     training: float = 0.0
     """In chunks, without compilation and evaluation."""
     compiling: float = 0.0
+    """Waiting for programs: most are compiled while training goes on."""
     timed_env_steps: int = 0
     """Environment steps of all seeds that `training` covers."""
 
@@ -68,24 +70,28 @@ def train(
     state: TrainState,
     env_steps: int = 0,
     clock: Clock | None = None,
-    on_compile: Callable[[], None] = lambda: None,
+    programs: Programs | None = None,
 ) -> Iterator[Progress]:
     """Train from a state (fresh, or of a checkpoint at `env_steps`) to the configured end.
 
-    Yields after every chunk. Raises Diverged after the first one with a loss or a parameter that is not finite.
+    programs: where they are being compiled already. Yields after every chunk. Raises Diverged after the first one with
+    a loss or a parameter that is not finite.
     """
+    if programs is None:
+        with Ahead() as ahead:
+            yield from train(trainer, config, state, env_steps, clock, prepare(ahead, trainer, config))
+        return
     clock = Clock() if clock is None else clock
     per_update, shown = config.steps_per_update, tasks.find(config.task).shown(trainer.table.names)
     done, total = env_steps // per_update, config.num_updates
     started, before = time.perf_counter(), clock
     compiling, training, timed = clock.compiling, clock.training, clock.timed_env_steps
-    chunk, compiling_evaluations = None, 0.0
+    chunk = None
     while done < total:
         updates = min(config.updates_per_chunk, total - done)
         if chunk is None:
-            on_compile()
             begun = time.perf_counter()
-            chunk = trainer.chunk.lower(state, updates).compile()
+            chunk = programs.chunk.result()
             compiling += time.perf_counter() - begun
             wait_for_all()
         begun = time.perf_counter()
@@ -95,15 +101,16 @@ def train(
         timed += updates * per_update * len(config.seeds)
         done += updates
         begun = time.perf_counter()
-        first = done == updates + env_steps // per_update
+        for program in programs.monitor:
+            program.result()
+        compiling += time.perf_counter() - begun
+        begun = time.perf_counter()
         evaluations = {
             "greedy": trainer.evaluate(state.learner, False, "monitor", config.evaluation.num_episodes),
             "sampled": trainer.evaluate(state.learner, True, "monitor", config.evaluation.num_episodes),
         }
         evaluations = jax.device_get(gathered(evaluations))
         playing = time.perf_counter() - begun
-        if first:  # compiling is nearly all of the first evaluation
-            compiling, compiling_evaluations, playing = compiling + playing, playing, 0.0
         wall = before.wall + time.perf_counter() - started
         clock = Clock(wall, training, compiling, timed)
         whole = gathered(state)
@@ -112,18 +119,16 @@ def train(
         told = [row["update"] for row in rows]
         replay = trainer.algorithm.replay(whole.learner)
         require_finite(config.seeds, told, whole.learner, replay, (done - updates) * per_update, done * per_update)
-        closing = _closing(trainer, config, compiling_evaluations, playing)
+        closing = _closing(trainer, config, playing)
         to_train, to_play = (total - done) * per_update * len(rows), -(-(total - done) // config.updates_per_chunk)
         left = seconds_left(to_train, clock.steps_per_second, to_play, playing, closing)
         yield Progress(done * per_update, total * per_update, clock, rows, state, shown, whole, left)
 
 
-def _closing(trainer: Trainer, config: RunConfig, compiling: float, playing: float) -> float:
+def _closing(trainer: Trainer, config: RunConfig, playing: float) -> float:
     """Seconds that will pass after the last chunk."""
     more = config.evaluation.final_episodes / config.evaluation.num_episodes
-    return closing_seconds(
-        compiling, playing, more, SHOWN_EPISODES * num_frames(trainer.evaluation_env.max_cycles)
-    )
+    return closing_seconds(playing, more, SHOWN_EPISODES * num_frames(trainer.evaluation_env.max_cycles))
 
 
 def _rows(

@@ -16,7 +16,7 @@ from gacrl.config import files as configuration
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
-from gacrl.versions import version
+from gacrl.versions import version, versions
 
 SHOWN_EPISODES = 4
 """Episodes that a run keeps, and shows in its GIF."""
@@ -234,12 +234,12 @@ def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
 
 
 def _origin(config: RunConfig, begun_from: str | None) -> dict[str, Any]:
-    """What made a run: the version, a task's source where it is not ours, and the run that it starts from."""
+    """What made a run: the versions, a task's source where it is not ours, and the run that it starts from."""
     own = tasks.brought(config.task)
     task = {"name": config.task}
     if own is not None:
         task |= {"source": own.source and own.source.name, "sha256": own.digest}
-    return {"gacrl": version(), "task": task, "from": begun_from}
+    return {"gacrl": version(), "versions": versions(), "task": task, "from": begun_from}
 
 
 def _is_run(path: Path) -> bool:

@@ -16,11 +16,11 @@ from gacrl.config.checks import whole
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
-from gacrl.evaluation import episodes, references
-from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation import episodes
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
+from gacrl.training.ahead import Ahead, closing, prepare
 from gacrl.training.build import (
     evaluated_settings,
     learner_shapes,
@@ -33,7 +33,7 @@ from gacrl.training.devices import anyone, gathered, leads, one_seed, same_every
 from gacrl.training.divergence import Diverged, Faulty
 from gacrl.training.keeper import ROWS, Keeper
 from gacrl.training.loop import Clock, Progress, train
-from gacrl.training.recorder import SHOWN_EPISODES, RunFolder
+from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer, TrainState
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
@@ -178,7 +178,24 @@ def _run(
     begun: TrainState | None = None,
 ) -> Ended:
     """begun: the state to begin with, stacked, where it is not a fresh one."""
+    with Ahead() as ahead:
+        return _to_the_end(ahead, folder, config, trainer, found, watcher, fingerprint, begun)
+
+
+def _to_the_end(
+    ahead: Ahead,
+    folder: RunFolder,
+    config: RunConfig,
+    trainer: Trainer,
+    found: checkpoint.Checkpoint | None,
+    watcher: Watcher,
+    fingerprint: str,
+    begun: TrainState | None,
+) -> Ended:
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
+    watcher.compiling()
+    programs = prepare(ahead, trainer, config, fresh=found is None and begun is None)
+    ending = ahead.run(_prepare_ending, ahead, trainer, config)
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
     with folder.writing(config.task):
         if leads():
@@ -194,7 +211,7 @@ def _run(
         keep = Keeper(folder, config.num_seeds, trainer.algorithm, task, fingerprint, writer, rows)
         if begun is not None and leads():
             keep.begin(gathered(state))
-        chunks = train(trainer, config, state, env_steps, clock, watcher.compiling)
+        chunks = train(trainer, config, state, env_steps, clock, programs)
         for progress in _explained(chunks, folder, config.task, env_steps):
             env_steps, state, clock = progress.env_steps, progress.state, progress.clock
             if leads():
@@ -206,7 +223,7 @@ def _run(
             if anyone(watcher.stop()) and not progress.done:
                 return Ended(folder.path, config, env_steps, None)
     watcher.finishing()
-    summary = _finish(folder, config, trainer, state, env_steps, clock)
+    summary = _finish(folder, config, trainer, state, env_steps, clock, ending.result())
     watcher.finished(summary)
     return Ended(folder.path, config, env_steps, summary)
 
@@ -239,8 +256,32 @@ def _clock(found: checkpoint.Checkpoint) -> Clock:
     return Clock(**{name: value for name, value in found.counters.items() if name in known})  # pyright: ignore[reportArgumentType]
 
 
+class _Ending(NamedTuple):
+    """What closes a run and does not wait for its policy."""
+
+    record: Any
+    """Compiled: episodes of a seed's learner."""
+    references: dict[str, dict[str, float]]
+    """The metrics of policies that learn nothing, where this process writes them."""
+
+
+def _prepare_ending(ahead: Ahead, trainer: Trainer, config: RunConfig) -> _Ending:
+    """Compile what closes a run, and play the policies that learn nothing."""
+    *_, record = [ahead.compiled(lower) for lower in closing(trainer, config)]
+    if ahead.left or not leads():
+        return _Ending(record, {})
+    settings, count = evaluated_settings(config), config.evaluation.final_episodes
+    return _Ending(record, evaluate_scripted(config.task, settings, count))
+
+
 def _finish(
-    folder: RunFolder, config: RunConfig, trainer: Trainer, state: TrainState, env_steps: int, clock: Clock
+    folder: RunFolder,
+    config: RunConfig,
+    trainer: Trainer,
+    state: TrainState,
+    env_steps: int,
+    clock: Clock,
+    ending: _Ending,
 ) -> dict[str, Any]:
     """The closing evaluation, some episodes to look at, and last the summary, which makes the run a finished one."""
     begun, num_episodes = time.perf_counter(), config.evaluation.final_episodes
@@ -252,12 +293,8 @@ def _finish(
     learner = one_seed(gathered(state.learner), 0)
     if not leads():
         return {}
-    references, facts = (
-        evaluate_scripted(config.task, settings, num_episodes),
-        task.facts(settings, trainer.table.names),
-    )
-    members = len(config.seeds)
-    _show(folder, config, trainer, learner)
+    facts, members = task.facts(settings, trainer.table.names), len(config.seeds)
+    _show(folder, config, episodes.cut(ending.record(learner)))
     summary = {
         "preset": config.preset,
         "task": facts,
@@ -265,11 +302,11 @@ def _finish(
         "env_steps": env_steps,
         "final": {
             kind: normalised(
-                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), references, facts
+                over_seeds({name: v.mean(1)[:members] for name, v in values.items()}), ending.references, facts
             )
             for kind, values in final.items()
         },
-        "references": references,
+        "references": ending.references,
         "episodes": num_episodes,
         "horizon": int(trainer.evaluation_env.max_cycles),
         "steps_per_second": clock.steps_per_second,
@@ -282,19 +319,9 @@ def _finish(
     return summary
 
 
-def _show(folder: RunFolder, config: RunConfig, trainer: Trainer, learner: Learner) -> None:
-    """Some episodes of the first seed to look at, and as a GIF where there is something to see."""
+def _show(folder: RunFolder, config: RunConfig, shown: list[episodes.Episode]) -> None:
+    """Keep episodes of the first seed to look at, and as a GIF where there is something to see."""
     task = tasks.find(config.task)
-    shown = episodes.record_many(
-        trainer.evaluation_env,
-        trainer.algorithm.policy(learner, False),
-        trainer.memory,
-        trainer.evaluation_params,
-        stream_key("report"),
-        SHOWN_EPISODES,
-        trainer.intervention,
-        look=references.look_of(task, evaluated_settings(config)),
-    )
     with folder.writing(config.task):
         folder.episodes.mkdir(exist_ok=True)
         for number, episode in enumerate(shown):

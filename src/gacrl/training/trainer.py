@@ -16,6 +16,7 @@ from gacrl import rollout
 from gacrl.algorithms.contract import Algorithm, Hyper
 from gacrl.algorithms.shared import share_out
 from gacrl.envs.environment import Environment, EnvParams
+from gacrl.evaluation.episodes import Look, Played, play
 from gacrl.evaluation.evaluate import Stream, evaluate, stream_key
 from gacrl.evaluation.metrics import (
     EpisodeSummary,
@@ -113,10 +114,11 @@ class Trainer:
         metrics: Mapping[str, Metric] = RETURN,
         watched: bool = False,
         intervention: Intervention | None = None,
+        look: Look | None = None,
     ):
         """params: the task's numbers, in training and as evaluated; None: those of the environments. metrics: the
         task's. watched: look for observations and rewards that are not finite. intervention: what happens to messages,
-        in training and evaluations alike."""
+        in training and evaluations alike. look: what there is to see of a state as evaluated."""
         self.algorithm = algorithm
         self.env = env
         self.curriculum = curriculum
@@ -130,7 +132,7 @@ class Trainer:
         self.evaluation_params = (
             self.evaluation_env.default_params() if evaluation_params is None else evaluation_params
         )
-        self.metrics, self.watched, self.intervention = metrics, watched, intervention
+        self.metrics, self.watched, self.intervention, self.look = metrics, watched, intervention, look
         self.mesh = mesh_for(num_seeds) if mesh is None else mesh
         """The devices that the seeds, and perhaps their environments, are spread over."""
         self.memory = algorithm.initial_memory(env.num_agents)
@@ -152,6 +154,10 @@ class Trainer:
     def init_member(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None) -> TrainState:
         """A fresh training state of one seed, with these hyperparameters in this task."""
         return self._init(key, hyper, self.params if params is None else params)
+
+    def lower_init(self, seed: int) -> Any:
+        """Lower what makes a fresh training state, to be compiled ahead."""
+        return Trainer._init.lower(self, stream_key("training", seed), self.algorithm.hyper, self.params)
 
     @partial(jax.jit, static_argnums=0)
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
@@ -253,3 +259,17 @@ class Trainer:
             )
 
         return map_seeds(one, self.mesh)(learners)
+
+    @partial(jax.jit, static_argnums=(0, 2, 3))
+    def record(self, learner: Learner, stream: Stream, num_episodes: int) -> Played:
+        """K greedy episodes of one seed's learner as they happen, the very ones that `evaluate` measures."""
+        return play(
+            self.evaluation_env,
+            self.algorithm.policy(learner, False),
+            self.memory,
+            self.evaluation_params,
+            stream_key(stream),
+            num_episodes,
+            self.intervention,
+            self.look,
+        )

@@ -1,4 +1,4 @@
-"""The claims of the paper, and the readings under which each of them is judged (in `comparisons`).
+"""The claims of the paper, and the readings under which each of them is judged (in `verdicts`).
 
 The claims, the readings under which each is repeated, and the paper's numbers are data: `claims.json` and
 `paper.json`. No verdict is written there. A reading changes one thing at a time: what a column of the tables
@@ -6,28 +6,40 @@ means, which episodes count, or which reward the algorithms were trained on.
 """
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from gacrl.experiments.paper.evidence import FINAL_EPISODES, Play
 
-Verdict: TypeAlias = Literal[
-    "holds",
-    "does not hold",
-    "cannot be told apart from random",
-    "cannot be decided with these seeds",
-    "not reproducible",
-    "not tested here",
-]
-HOLDS: Verdict = "holds"
-FAILS: Verdict = "does not hold"
-AS_RANDOM: Verdict = "cannot be told apart from random"
-OPEN: Verdict = "cannot be decided with these seeds"
-IRREPRODUCIBLE: Verdict = "not reproducible"
-UNTESTED: Verdict = "not tested here"
+Agreement: TypeAlias = Literal["agrees", "disagrees", "undecided", "not tested"]
+"""Whether our runs agree with what is printed or claimed."""
+AGREES: Agreement = "agrees"
+DISAGREES: Agreement = "disagrees"
+OPEN: Agreement = "undecided"
+UNTESTED: Agreement = "not tested"
+
+Chance: TypeAlias = Literal["told from random", "not told from random", "equivalent to random", ""]
+"""Whether it could be random's, asked apart from the agreement; empty where random plays no part.
+
+Equivalent is what two one-sided tests within a margin find, and nothing else.
+"""
+TOLD: Chance = "told from random"
+NOT_TOLD: Chance = "not told from random"
+EQUIVALENT: Chance = "equivalent to random"
+NO_CHANCE: Chance = ""
+
+SENSES: Mapping[str, str] = MappingProxyType(
+    {
+        "open": "the agents leave the 2 × 2 space: nothing in the environment holds them there",
+        "start": "the one value is where the other begins",
+    }
+)
+"""Readings of what the paper says of itself."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +52,8 @@ class Measure:
     better: Literal["higher", "lower"]
     printed: str
     """The column of the paper's tables."""
+    least: float = -math.inf
+    most: float = math.inf
 
     @property
     def sign(self) -> float:
@@ -57,6 +71,8 @@ class Reading:
     """A row of Table II is one episode, or the mean of the 50 before it."""
     swap: tuple[str, str] | None = None
     """A measure, and the one that takes its place."""
+    sense: str = ""
+    """One of `SENSES`."""
 
     def measure(self, name: str) -> Measure:
         """The measure of that name, or its substitute."""
@@ -77,6 +93,8 @@ class Reading:
         if self.swap:
             old, new = (measures()[name] for name in self.swap)
             said = f"{old.label}: {new.says}"
+        if self.sense:
+            said = SENSES[self.sense]
         return said or "as docs/algorithm.md reads it"
 
 
@@ -96,11 +114,21 @@ class Claim:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A verdict under one reading, and the numbers that decide."""
+    """A verdict on both axes under one reading, and the numbers that decide."""
 
-    verdict: Verdict
+    agreement: Agreement
+    chance: Chance
     because: str
+    numbers: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What the sentence is made from, as JSON data: every seed's value."""
+    detail: str = ""
+    """What of it decides, where there are several numbers: it may change though the verdict does not."""
     reading: Reading = Reading()
+
+    @property
+    def verdict(self) -> str:
+        """Both axes in words."""
+        return "; ".join(part for part in (self.agreement, self.chance) if part)
 
 
 @dataclass(frozen=True)
@@ -115,8 +143,24 @@ class Judged:
 
     @property
     def hangs_on(self) -> tuple[Outcome, ...]:
-        """The readings that change the verdict."""
-        return tuple(outcome for outcome in self.alternatives if outcome.verdict != self.base.verdict)
+        """The readings that change the verdict. One that was not tested changes nothing."""
+        tested = (outcome for outcome in self.alternatives if outcome.agreement != UNTESTED)
+        return tuple(outcome for outcome in tested if outcome.verdict != self.base.verdict)
+
+    @property
+    def details(self) -> tuple[Outcome, ...]:
+        """The readings that change what decides, and not the verdict."""
+        same = (outcome for outcome in self.alternatives if outcome.verdict == self.base.verdict)
+        return tuple(outcome for outcome in same if outcome.detail != self.base.detail)
+
+
+def tests(judged: Sequence[Judged]) -> tuple[tuple[Judged, ...], ...]:
+    """The claims by the test that they rest on, in the order of the first: several may rest on one."""
+    groups: dict[str, list[Judged]] = {}
+    for one in judged:
+        test = json.dumps([one.claim.kind, dict(one.claim.settings)], sort_keys=True)
+        groups.setdefault(test, []).append(one)
+    return tuple(tuple(group) for group in groups.values())
 
 
 @cache

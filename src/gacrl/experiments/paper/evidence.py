@@ -4,8 +4,9 @@ S seeds, K stretches of training (the episodes between two lines of the log), E 
 """
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -14,7 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gacrl.config.run import RunConfig
-from gacrl.experiments.paper.tables import SCRIPTED, reference_episodes
+from gacrl.experiments.paper import references as scripted
+from gacrl.experiments.paper.references import Difficulty, Episodes, difficulty
+from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.study import reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
@@ -28,6 +31,8 @@ COLUMNS: Mapping[str, str] = MappingProxyType(
 """What the algorithms are trained on: the paper's reward and curriculum, MPE2's reward, or MPE2's task in earnest."""
 FINAL_EPISODES = 50
 """What the paper's final metrics cover, and what a random policy is averaged over beside them."""
+FIXED_RATIO = "reward_shaped_fixed_ratio"
+"""Equation (1) with r_raw at the local ratio 0.5 of the log, instead of that of the moment."""
 
 
 class MissingRun(LookupError):
@@ -55,6 +60,8 @@ class Series:
     """What the scripted policies reach on the closing evaluation's starts."""
     seconds: float
     """Of all seeds together, evaluations and compilation included."""
+    commit: str = ""
+    """Of the code that trained it, where it is known."""
 
     @property
     def closing(self) -> tuple[Metrics, Metrics, int]:
@@ -91,12 +98,16 @@ class Evidence:
     diverged: Mapping[tuple[str, str], str] = field(default_factory=dict[tuple[str, str], str])
     """What ended the training of those that are not in `series`."""
 
+    def has(self, column: str, who: str) -> bool:
+        """Whether an algorithm was trained to its end."""
+        return (_trained_on(column, who), who) in self.series
+
     def trained(self, column: str, who: str) -> Series:
         """An algorithm's series. Raises MissingRun for one that diverged.
 
         The column `mixed` has GACRL on the paper's reward and everyone else on MPE2's.
         """
-        column = ("paper" if who == "GACRL" else "mpe2") if column == "mixed" else column
+        column = _trained_on(column, who)
         if (column, who) in self.diverged:
             raise MissingRun(f"{who} diverged on {COLUMNS[column]}: {self.diverged[column, who]}")
         return self.series[column, who]
@@ -115,6 +126,10 @@ class Evidence:
             return measured(weights, series.closing[0] if play == "training" else series.final[play])
         reference = self.reference(column, who)
         return blocks(measured(weights, reference.stretches[-1] if play == "training" else reference.final))
+
+
+def _trained_on(column: str, who: str) -> str:
+    return ("paper" if who == "GACRL" else "mpe2") if column == "mixed" else column
 
 
 def measured(weights: Mapping[str, float], metrics: Metrics) -> Float[np.ndarray, "..."]:
@@ -139,6 +154,8 @@ def _read_series(path: Path) -> Series:
     folder = RunFolder.open(path)
     config, rows = folder.config(), folder.metrics()
     summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
+    if summary["seeds"] != list(config.seeds):
+        raise ValueError(f"it holds seeds {summary['seeds']}, not {list(config.seeds)}")
     by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
     ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
     kept = np.flatnonzero(ended.min(0) > 0)
@@ -149,17 +166,24 @@ def _read_series(path: Path) -> Series:
             name: np.array([[seen[k]["train"][what][name] for k in kept] for seen in by_seed]) for name in names
         }
 
+    ends = np.array([by_seed[0][k]["task"]["local_ratio"] for k in kept])
+    midway = (ends + np.append(config.env.local_ratio, ends[:-1])) / 2
+    sd = stacked("sd")
     return Series(
         config=config,
         episodes=np.array([by_seed[0][k]["episodes_done"] for k in kept]),
         counted=ended[0][kept],
-        mean=stacked("mean"),
-        sd=stacked("sd"),
-        last=stacked("last_episode"),
+        mean=_with_fixed_ratio(stacked("mean"), midway),
+        sd={**sd, FIXED_RATIO: sd["reward_shaped"]},
+        last=_with_fixed_ratio(stacked("last_episode"), ends),
         tasks=tuple(by_seed[0][k]["task"] for k in kept),
-        final={kind: _final(summary["final"][kind]) for kind in ("greedy", "sampled")},
+        final={
+            kind: _with_fixed_ratio(_final(summary["final"][kind]), config.env.local_ratio)
+            for kind in ("greedy", "sampled")
+        },
         scripted=summary["references"],
         seconds=float(summary["wall_seconds"]),
+        commit=summary.get("versions", {}).get("git_commit", ""),
     )
 
 
@@ -167,32 +191,43 @@ def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {name: np.array(entry["values"]) for name, entry in metrics.items() if not name.startswith("score_")}
 
 
-def gather(folders: Mapping[tuple[str, str], Path]) -> Evidence:
-    """The evidence of run folders that are finished or diverged, and of scripted policies in the same tasks."""
+def _with_fixed_ratio(metrics: Metrics, ratio: float | np.ndarray) -> Metrics:
+    """Add equation (1) with r_raw at the local ratio 0.5.
+
+    r_raw at the ratio r is −r · collisions − (1 − r) · 3 · distance from landmarks, so that at r it is less by
+    (1 − 2r)(r_raw + 3 · distance) than what is logged, at 0.5.
+    """
+    less = (1.0 - 2.0 * np.asarray(ratio)) * (metrics["reward_raw"] + 3.0 * metrics["distance_landmark_agent"])
+    return {**metrics, FIXED_RATIO: metrics["reward_shaped"] + less}
+
+
+def gather(
+    folders: Mapping[tuple[str, str], Path], out: Path, say: Callable[[str], None] = lambda sentence: None
+) -> Evidence:
+    """The evidence of run folders that are finished or diverged, and of scripted policies in the same tasks.
+
+    out: the study's folder, which keeps the episodes of the scripted policies.
+    """
     reasons = {key: why_diverged(path) for key, path in folders.items()}
     diverged = {key: because for key, because in reasons.items() if because is not None}
     series = {key: read_series(path) for key, path in folders.items() if key not in diverged}
-    references: dict[tuple[str, str], Reference] = {}
-    for column in ("paper", "mpe2"):
-        followed = next(found for (at, _), found in series.items() if at == column)  # GACRL's, where it is there
-        references |= {(column, name): _play(name, followed) for name in SCRIPTED}
+    followed = {
+        column: next(found for (at, _), found in series.items() if at == column)  # GACRL's, where it is there
+        for column in ("paper", "mpe2")
+    }
+    config = followed["paper"].config
+    configured = (config.env.local_ratio, config.env.coverage_threshold)
+    stretches = {column: [difficulty(task) for task in found.tasks] for column, found in followed.items()}
+    played = scripted.played(out, config, [configured, *chain(*stretches.values())], say)
+    references = {
+        (column, who): _beside(played[who], at, configured) for column, at in stretches.items() for who in SCRIPTED
+    }
     return Evidence(series, references, diverged)
 
 
-def _play(name: str, followed: Series) -> Reference:
-    """A scripted policy beside a series; a difficulty that stays the same is played once."""
-    config = replace(
-        followed.config, env=replace(followed.config.env, reward="paper")
-    )  # one program for all columns
-    played: dict[tuple[float, float], dict[str, np.ndarray]] = {}
-
-    def at(task: Mapping[str, float]) -> dict[str, np.ndarray]:
-        key = (task["local_ratio"], task["coverage_threshold"])
-        if key not in played:
-            episodes = reference_episodes(name, config, task)
-            played[key] = {metric: np.asarray(values, float) for metric, values in episodes.items()}
-        return played[key]
-
-    env = config.env
-    configured = {"local_ratio": env.local_ratio, "coverage_threshold": env.coverage_threshold}
-    return Reference(tuple(at(task) for task in followed.tasks), at(configured))
+def _beside(
+    episodes: Mapping[Difficulty, Episodes], stretches: list[Difficulty], configured: Difficulty
+) -> Reference:
+    """A scripted policy at the difficulty of each stretch, and as evaluated."""
+    scored = {at: _with_fixed_ratio(metrics, at[0]) for at, metrics in episodes.items()}
+    return Reference(tuple(scored[at] for at in stretches), scored[configured])

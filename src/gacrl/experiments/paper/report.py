@@ -4,9 +4,7 @@ Every number and every verdict in it is computed from the runs; the sentences ar
 """
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,10 @@ from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.statistics import probability_of_improvement, with_interval
 from gacrl.experiments.paper import report_tables as reproduce_tables
-from gacrl.experiments.paper.claims import Judged, untrained
+from gacrl.experiments.paper import report_verdicts
+from gacrl.experiments.paper.claims import Judged
 from gacrl.experiments.paper.evidence import COLUMNS, Evidence
+from gacrl.experiments.paper.references import EPISODES
 from gacrl.experiments.paper.report_tables import interquartile
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.report.page import Page
@@ -27,109 +27,64 @@ _INDICATIVE = 10
 def write(out: Path, evidence: Evidence, judged: Sequence[Judged], seeds: int, episodes: int) -> Path:
     """Write `report.html`, `report.md` and `results.json` into the folder; returns the HTML file's path."""
     page = Page("GACRL: the paper's experiment, theirs and ours")
-    _opening(page, evidence, judged, seeds, episodes)
-    _verdicts(page, judged)
+    _opening(page, evidence, seeds, episodes)
+    report_verdicts.summary(page, judged)
+    _caveats(page, evidence)
+    reproduce_tables.training_figures(page, evidence)
     reproduce_tables.table_1(page, evidence)
     reproduce_tables.environment(page)
-    reproduce_tables.training_figures(page, evidence)
     reproduce_tables.table_2(page, evidence)
     reproduce_tables.table_3(page, evidence)
     reproduce_tables.agent_distance(page, evidence)
-    reproduce_tables.printed_numbers(page, evidence)
-    _readings(page, judged)
+    reproduce_tables.printed_numbers(page, evidence, judged)
     _extended(page, evidence)
+    report_verdicts.method(page)
+    report_verdicts.every_test(page, judged)
+    report_verdicts.every_reading(page, judged)
     _making(page, evidence, seeds, episodes)
-    (out / "results.json").write_text(json.dumps(_results(judged), indent=2) + "\n", encoding="utf-8")
+    data = {
+        "seeds": seeds,
+        "episodes": episodes,
+        "commits": _commits(evidence),
+        "reference_episodes": EPISODES,
+        "claims": report_verdicts.results(judged),
+    }
+    (out / "results.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     return page.write(out, "report")
 
 
-def _results(judged: Sequence[Judged]) -> list[dict[str, Any]]:
-    return [
-        {
-            "id": j.claim.id,
-            "section": j.claim.section,
-            "quote": j.claim.quote,
-            "in_print": j.in_print,
-            "verdict": j.base.verdict,
-            "because": j.base.because,
-            "readings": [
-                {
-                    "reading": asdict(o.reading),
-                    "says": o.reading.describe(),
-                    "verdict": o.verdict,
-                    "because": o.because,
-                }
-                for o in j.alternatives
-            ],
-        }
-        for j in judged
-    ]
-
-
-def _opening(page: Page, evidence: Evidence, judged: Sequence[Judged], seeds: int, episodes: int) -> None:
-    counts = Counter(j.base.verdict for j in judged)
+def _opening(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
     page.text(
         f"GACRL as printed, QMIX, MAPPO and IPPO, {episodes:,} episodes of 75 steps each, {seeds} seeds; random, "
         "doing nothing and an oracle play the same task. "
         + ("" if seeds >= _INDICATIVE else f"With {seeds} seeds all of it is indicative. ")
-        + f"Of {len(judged)} claims: "
-        + "; ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
-        + f". {sum(bool(j.hangs_on) for j in judged)} verdicts change under some other reading of the paper."
+        + "Every claim is asked two questions, apart: do our runs agree with it, and can random be told from it?"
     )
+    commits = _commits(evidence)
+    if len(commits) > 1:
+        page.text(f"The runs are not of one version of the code, but of {', '.join(commits)}.")
+
+
+def _caveats(page: Page, evidence: Evidence) -> None:
     page.text(
         "The paper does not define its columns, the reward of its baselines or what a row is. The readings used "
         "here (docs/algorithm.md) were chosen because they fit the printed numbers, so that a match is no "
         "independent evidence, and nothing here says how the printed numbers came about. Every verdict is "
         "therefore repeated under the other readings, below."
     )
-    page.text(
-        '"Cannot be told apart" means that the 95 % interval of a difference includes 0, or that a printed number '
-        "lies in the interval that random gives; it shows no equality. Intervals over seeds are bootstrapped around "
-        "the interquartile mean (IQM)."
-    )
     for (column, who), because in evidence.diverged.items():
         weighed = (
             " Equation (18) weighs log π by the immediate reward; MPE2's is never positive, and then no bound "
         )
         page.text(
-            f"{who} diverged when trained on {COLUMNS[column]} ({because}), and is missing there."
+            f"{who} diverged when trained on {COLUMNS[column]} ({because}). What needs that run is not tested."
             + (weighed + "holds the loss from below." if (column, who) == ("mpe2", "GACRL") else "")
         )
 
 
-def _verdicts(page: Page, judged: Sequence[Judged]) -> None:
-    page.heading("Every claim of the paper")
-    rows = [
-        [
-            j.claim.section,
-            f"“{j.claim.quote}”",
-            j.in_print,
-            j.base.verdict,
-            j.base.because,
-            "; ".join(f"{o.reading.describe()} → {o.verdict}" for o in j.hangs_on),
-        ]
-        for j in judged
-    ]
-    page.table(
-        ("where", "claim", "in the paper's own table", "verdict here", "because", "under another reading"), rows
-    )
-    page.text(
-        "Differences have their 95 % interval over seeds. Detectable: the smallest difference that so many seeds would "
-        "show in 80 % of all repetitions; a smaller one may be there without being seen."
-    )
-
-
-def _readings(page: Page, judged: Sequence[Judged]) -> None:
-    page.heading("Every verdict under every reading")
-    rows = [
-        [j.claim.id, outcome.reading.describe(), outcome.verdict, outcome.because]
-        for j in judged
-        for outcome in (j.base, *j.alternatives)
-        if j.alternatives
-    ]
-    page.table(("claim", "reading", "verdict", "because"), rows)
-    page.text("Readings that need other training, and are not trained here; `gacrl train` takes these settings:")
-    page.table(("place", "setting"), [[entry["place"], entry["setting"]] for entry in untrained()])
+def _commits(evidence: Evidence) -> list[str]:
+    """Of the code that trained the runs."""
+    return sorted({series.commit or "unknown" for series in evidence.series.values()})
 
 
 def _extended(page: Page, evidence: Evidence) -> None:
@@ -186,6 +141,7 @@ def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
         for (column, who), series in evidence.series.items()
     ]
     page.table(("who", "trained on", "seeds", "steps a seed", "time, all seeds", "settings"), rows)
+    page.text(f"Code of commit {', '.join(_commits(evidence))}.")
 
 
 def _settings(config: RunConfig) -> str:

@@ -1,7 +1,7 @@
 """The paper's experiment: GACRL, QMIX, MAPPO and IPPO on the paper's schedule, several seeds of each.
 
 Every pair of column and algorithm is a run folder of its own, so that a stopped reproduction goes on with what
-is missing. What the runs showed is judged in `comparisons` and written down in `reproduce_report`.
+is missing. What the runs showed is judged in `verdicts` and written down in `report`.
 """
 
 from collections.abc import Mapping
@@ -62,7 +62,10 @@ class Reproduction:
         return {
             "out": str(self.out),
             "report": str(self.report),
-            "claims": {judged.claim.id: judged.base.verdict for judged in self.judged},
+            "claims": {
+                judged.claim.id: {"agreement": judged.base.agreement, "random": judged.base.chance}
+                for judged in self.judged
+            },
         }
 
 
@@ -130,8 +133,7 @@ def reproduce(
     watch.planned({run.name: "" for run in runs})
     if not train_missing(runs, watch):
         return None
-    watch.say("playing random, noop and oracle at the difficulty of every stretch")
-    found = evidence.gather({place: run.folder for place, run in planned.items()})
+    found = evidence.gather({place: run.folder for place, run in planned.items()}, out, watch.say)
     if ("paper", "GACRL") in found.diverged:
         raise UserError(f"there is nothing to compare with: GACRL's {found.diverged['paper', 'GACRL']}")
     judged = judge_all(found)

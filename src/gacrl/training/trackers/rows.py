@@ -5,11 +5,11 @@ from typing import Any
 
 
 def flat(row: Mapping[str, Any], before: str = "", joint: str = ".") -> dict[str, Any]:
-    """Return the same values under joined names, `greedy.return_agent_mean`; what has no value is left out."""
+    """Return the same values under joined names: `greedy.return_agent_mean`."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
             found |= flat(value, f"{before}{name}{joint}", joint)
-        elif value is not None:
+        else:
             found[before + name] = value
     return found
