@@ -77,7 +77,7 @@ export function actionName(page, action) {
 }
 
 export function percent(share) {
-  return `${Math.round(100 * share)} %`;
+  return `${Math.round(100 * share)}\u00a0%`;  // no line ends before the sign
 }
 
 function far(distance) {
