@@ -128,10 +128,10 @@ def in_node(folder: Path, script: str, data: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "run",
     [
-        lambda: shipped("gacrl"),
+        pytest.param(lambda: shipped("gacrl"), marks=pytest.mark.soak),
         lambda: shipped("gacrl-teams", num_agents=16, arena_scale=1.5),
         lambda: shipped("gacrl-reference"),
-        lambda: shipped("gacrl-colours"),
+        pytest.param(lambda: shipped("gacrl-colours"), marks=pytest.mark.soak),
         lambda: untrained("speaker_listener", {"latent": "none"}),
         lambda: untrained("colours", {"speaker_identity": True}, graph="full", named=False),
     ],
