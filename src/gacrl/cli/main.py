@@ -400,7 +400,8 @@ def _render(words: Words) -> int:
         from gacrl.messages.interventions import silence
         from gacrl.render import Beside
 
-        other, also = record(silence() if happens is None else happens)
+        with _called("--beside", "the intervention"):
+            other, also = record(silence() if happens is None else happens)
         beside = Beside(other.episodes, f"{also}: {asked.run}")
     film.write(shown.episodes, out, asked.size, title, shown.task.words, beside)
     notes = "".join(f"; {note}" for note in (told, f"beside them {also}" if also else "") if note)
