@@ -1,6 +1,8 @@
 """Write the pages of docs/pages: every policy that comes with the package, as `gacrl export` writes it.
 
     python benchmarks/pages.py
+
+The same policies give the same bytes.
 """
 
 from pathlib import Path

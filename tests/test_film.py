@@ -82,3 +82,24 @@ def test_a_gif_needs_nobody(nobodys, tmp_path: Path):
     film.write([world([[0, 0]], [[0.2, 0]])], tmp_path / "film.GIF", size=120)
     with Image.open(tmp_path / "film.GIF") as picture:
         assert picture.format == "GIF"
+
+
+def test_a_strip_shows_moments_in_rows_and_what_is_beside_below(tmp_path: Path):
+    played = [world([[0, 0]], [[0.2, 0]], steps=4), world([[0, 0]], [[0.2, 0]], steps=2)]
+    others = [world([[0.5, 0]], [[0.2, 0]], steps=2), world([[3, 0]], [[0.2, 0]], steps=2)]
+    beside = render.Beside(others, "silent")
+    out = tmp_path / "strip.png"
+    film.write(played, out, size=120, title="as it is", beside=beside)
+    first = render.frame(played[0], 0, 120)
+    with Image.open(out) as strip:
+        assert strip.size == (5 * first.width, 4 * first.height), "five moments of the longer one, four rows"
+        picture = np.asarray(strip.convert("RGB"))
+    assert (picture[2 * first.height :, 3 * first.width :] == 255).all(), "the other has three"
+    films = list(render.drawn(played, 120, "as it is", beside=beside))
+    assert len(films) == len(render.durations(played, 10, beside)) == 5 + 3
+    wide = np.asarray(films[4])
+    assert wide.shape[1] == 2 * first.width
+    np.testing.assert_array_equal(wide[:, : first.width], picture[: first.height, -first.width :])
+    np.testing.assert_array_equal(wide[:, first.width :], picture[first.height : 2 * first.height, -first.width :])
+    with pytest.raises(UserError, match=r"a strip shows at most 6 episodes so, not 7; say --episodes 6"):
+        film.write(played * 3 + played[:1], out, beside=render.Beside(others * 3 + others[:1], ""))

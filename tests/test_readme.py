@@ -21,6 +21,7 @@ from gacrl.config.algorithms import GacrlConfig
 from gacrl.config.run import RunConfig
 from gacrl.experiments import scoring
 from gacrl.experiments.paper import tables as paper_tables
+from gacrl.export import html
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -71,6 +72,7 @@ def room_of_short_schedules(tmp_path_factory, quick_start):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "PRESETS", MappingProxyType({**presets.PRESETS, **shortened}))
         patch.setattr(scoring, "score_run", few)
+        patch.setattr(html, "HEARD", 4)
         patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         folder = tmp_path_factory.mktemp("readme")
         (folder / "examples").symlink_to(ROOT / "examples")

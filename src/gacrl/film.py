@@ -1,4 +1,4 @@
-"""Episodes as a file to watch, of the kind that its name says: GIF, or MP4 where ffmpeg is at hand."""
+"""Episodes as a file to look at, of the kind that its name says: PNG, GIF, or MP4 where ffmpeg is at hand."""
 
 import os
 import shutil
@@ -12,7 +12,7 @@ from pathlib import Path
 from gacrl import render
 from gacrl.errors import UserError
 from gacrl.evaluation.episodes import Episode, written_whole
-from gacrl.render import WORDS
+from gacrl.render import WORDS, Beside
 from gacrl.tasks.task import Words
 
 _FPS = 10
@@ -21,31 +21,51 @@ _FPS = 10
 def require_format(path: Path) -> None:
     """Raises UserError, with one sentence, for a name that ends in no format that can be written here."""
     kind = path.suffix.lower()
-    if kind not in (".gif", ".mp4"):
+    if kind not in (".png", ".gif", ".mp4"):
         what = f"cannot write {kind[1:].upper()}" if kind else "its name does not say what to write"
-        raise UserError(f"{path}: {what}; --out must end in .gif or, with ffmpeg installed, in .mp4")
+        raise UserError(f"{path}: {what}; --out must end in .png, .gif or, with ffmpeg installed, in .mp4")
     if kind == ".mp4" and _ffmpeg() is None:
         raise UserError(
             f"{path}: MP4 needs ffmpeg, and there is none on the PATH: install it, or let --out end in .gif"
         )
 
 
-def write(episodes: Sequence[Episode], path: Path, size: int = 480, title: str = "", words: Words = WORDS) -> None:
-    """Write the episodes, one after the other, in the format that the path ends in; see `render.gif`.
+def write(
+    episodes: Sequence[Episode],
+    path: Path,
+    size: int = 480,
+    title: str = "",
+    words: Words = WORDS,
+    beside: Beside | None = None,
+) -> None:
+    """Write the episodes, one after the other, in the format that the path ends in; see `render.gif`, `render.strip`.
 
     Raises UserError where that cannot be, OSError where the file cannot be written.
     """
     require_format(path)
-    if path.suffix.lower() == ".gif":
-        render.gif(episodes, path, size, _FPS, title, words)
+    kind = path.suffix.lower()
+    if kind == ".png":
+        require_rows(path, len(episodes), beside is not None)
+        render.strip(episodes, path, size, title, words, beside)
+    elif kind == ".gif":
+        render.gif(episodes, path, size, _FPS, title, words, beside)
     else:
-        _mp4(episodes, path, size, title, words)
+        _mp4(episodes, path, size, title, words, beside)
 
 
-def _mp4(episodes: Sequence[Episode], path: Path, size: int, title: str, words: Words) -> None:
+def require_rows(path: Path, episodes: int, beside: bool) -> None:
+    """Raise UserError for a strip of too many episodes; films have as many as they like."""
+    most = render.MOST_ROWS // (1 + beside)
+    if path.suffix.lower() == ".png" and episodes > most:
+        raise UserError(f"{path}: a strip shows at most {most} episodes so, not {episodes}; say --episodes {most}")
+
+
+def _mp4(
+    episodes: Sequence[Episode], path: Path, size: int, title: str, words: Words, beside: Beside | None
+) -> None:
     """Pipe the frames to ffmpeg; one that is seen for longer is sent several times."""
-    times = [max(1, round(pause * _FPS / 1000)) for pause in render.durations(episodes, _FPS)]
-    frames = render.drawn(episodes, size, title, words)
+    times = [max(1, round(pause * _FPS / 1000)) for pause in render.durations(episodes, _FPS, beside)]
+    frames = render.drawn(episodes, size, title, words, 1, beside)
     first = next(frames)
     with written_whole(path) as file, tempfile.TemporaryFile() as said:
         command = [

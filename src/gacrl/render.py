@@ -1,4 +1,4 @@
-"""Pictures of episodes: one frame, or an animated GIF of several, drawn without a display.
+"""Pictures of episodes: one frame, a strip of several, or an animated GIF, drawn without a display.
 
 What is drawn is a `gacrl.scene.Scene`: agents are discs with their number, speech bubbles hold the symbol that each one
 sends, and marks are rings that turn green when lit. Colours can be told apart by the colour-blind, and nothing is said
@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, SupportsIndex, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, SupportsIndex, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -55,8 +55,18 @@ _FIRST_SECONDS, _LAST_SECONDS = 0.6, 1.5
 MOST_FRAMES = 200
 """Of an episode: of a longer one so many moments are shown, evenly spread."""
 
+MOST_ROWS = 12
+"""Of a strip."""
+
 _Point: TypeAlias = tuple[float, float]
 WORDS = Words()
+
+
+class Beside(NamedTuple):
+    """Episodes from the same starts, one for each of those that they are shown beside."""
+
+    episodes: Sequence[Episode]
+    title: str
 
 
 def gif(
@@ -66,38 +76,86 @@ def gif(
     fps: int | float = 10,
     title: str = "",
     words: Words = WORDS,
+    beside: Beside | None = None,
 ) -> None:
-    """Write the episodes, one after the other, as an animated GIF that is `size` pixels wide.
+    """Write the episodes, one after the other, as an animated GIF; each picture is `size` pixels wide.
 
     An episode of more than `MOST_FRAMES` moments is thinned to so many. One frame at a time is in memory. words: what
     the task calls the things in it. Raises OSError where the file cannot be written, ValueError without episodes, for
     one without a scene, or for an impossible size or speed.
     """
     pixels = whole(size, "size")
-    pauses = durations(episodes, fps)
+    pauses = durations(episodes, fps, beside)
     with written_whole(path) as file:
-        palette = _palette(drawn(episodes, pixels, title, words, -(-len(pauses) // _SAMPLES)))
+        palette = _palette(drawn(episodes, pixels, title, words, -(-len(pauses) // _SAMPLES), beside))
         film = _Film(file, palette.getpalette() or [])
-        for picture, pause in zip(drawn(episodes, pixels, title, words), pauses, strict=True):
+        for picture, pause in zip(drawn(episodes, pixels, title, words, 1, beside), pauses, strict=True):
             film.add(np.asarray(picture.quantize(palette=palette, dither=Image.Dither.NONE)), pause)
         film.end()
 
 
+def strip(
+    episodes: Sequence[Episode],
+    path: Path,
+    size: SupportsIndex = 480,
+    title: str = "",
+    words: Words = WORDS,
+    beside: Beside | None = None,
+    moments: int = 6,
+) -> None:
+    """Write so many moments of each episode, evenly spread, as one PNG: a row an episode, what is beside it below.
+
+    Raises OSError where the file cannot be written, ValueError without episodes or for more than `MOST_ROWS` rows.
+    """
+    pixels, count = whole(size, "size"), len(episodes) * (1 if beside is None else 2)
+    if not 1 <= count <= MOST_ROWS:
+        raise ValueError(f"a strip has 1 to {MOST_ROWS} rows, not {count}: show fewer episodes")
+    rows: list[np.ndarray] = []
+    for pictures, last in _pictured(episodes, pixels, title, words, beside):
+        times = [round(moment) for moment in np.linspace(0, last, min(moments, last + 1)).tolist()]
+        rows += [np.hstack([np.asarray(picture.draw(t)) for t in times]) for picture in pictures]
+    width = max(row.shape[1] for row in rows)
+    white = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    with written_whole(path) as file:
+        Image.fromarray(np.vstack(white)).save(file, "PNG")
+
+
 def drawn(
-    episodes: Sequence[Episode], size: int, title: str = "", words: Words = WORDS, step: int = 1
+    episodes: Sequence[Episode],
+    size: int,
+    title: str = "",
+    words: Words = WORDS,
+    step: int = 1,
+    beside: Beside | None = None,
 ) -> Iterator[Image.Image]:
     """Draw every `step`-th frame of the episodes, one after the other."""
     number = 0
-    for k, episode in enumerate(episodes, 1):
-        note = f"episode {k} of {len(episodes)}" if len(episodes) > 1 else ""
-        picture = _Photos(episode, size) if episode.scene is None else _Picture(episode, size, title, note, words)
-        for t in _moments(episode.num_steps):
+    for pictures, last in _pictured(episodes, size, title, words, beside):
+        for t in _moments(last):
             if number % step == 0:
-                yield picture.draw(t)
+                frames = [picture.draw(t) for picture in pictures]
+                yield frames[0] if len(frames) == 1 else Image.fromarray(np.hstack(list(map(np.asarray, frames))))
             number += 1
 
 
-def durations(episodes: Sequence[Episode], fps: int | float) -> list[int]:
+def _pictured(
+    episodes: Sequence[Episode], size: int, title: str, words: Words, beside: Beside | None
+) -> Iterator[tuple[list["_Picture | _Photos"], int]]:
+    """Lay out each episode, and what stands beside it, on the same ground; and their last moment."""
+    for k, episode in enumerate(episodes):
+        note = f"episode {k + 1} of {len(episodes)}" if len(episodes) > 1 else ""
+        if beside is None:
+            yield [_picture(episode, size, title, note, words)], episode.num_steps
+            continue
+        other = beside.episodes[k]
+        pictures = [
+            _picture(episode, size, title, note, words, other.scene),
+            _picture(other, size, beside.title, note, words, episode.scene),
+        ]
+        yield pictures, max(episode.num_steps, other.num_steps)
+
+
+def durations(episodes: Sequence[Episode], fps: int | float, beside: Beside | None = None) -> list[int]:
     """Return for how many milliseconds each frame of the episodes is seen.
 
     Raises ValueError without episodes, or for an impossible speed.
@@ -107,7 +165,9 @@ def durations(episodes: Sequence[Episode], fps: int | float) -> list[int]:
     speed = typed(fps, float, "fps")
     if not 0 < speed <= 50:
         raise ValueError(f"fps must be above 0 and at most 50, not {fps}")
-    return [pause for episode in episodes for pause in _durations(num_frames(episode.num_steps), speed)]
+    others = episodes if beside is None else beside.episodes
+    lengths = [max(one.num_steps, other.num_steps) for one, other in zip(episodes, others, strict=True)]
+    return [pause for steps in lengths for pause in _durations(num_frames(steps), speed)]
 
 
 def num_frames(num_steps: int) -> int:
@@ -200,14 +260,15 @@ def _palette(samples: Iterable[Image.Image]) -> Image.Image:
     return palette
 
 
-def _view(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
-    """Centre and half the width of the square that holds all that happens, and all of the ground."""
-    corners: list[Any] = [scene.ground.reshape(-1, 2), scene.lines.reshape(-1, 2)]
-    for group in (scene.agents, scene.marks):
-        places, radius = group.positions[group.there], group.radius[group.there][:, None]
-        corners += [places - radius, places + radius]
-    if not _has_ground(scene):
-        corners = corners[1:]
+def _view(*scenes: Scene) -> tuple[Float[np.ndarray, "2"], float]:
+    """Centre and half the width of the square that holds all that happens in scenes, and all of the ground."""
+    corners: list[Any] = []
+    for scene in scenes:
+        corners += [scene.lines.reshape(-1, 2)]
+        corners += [scene.ground.reshape(-1, 2)] if _has_ground(scene) else []
+        for group in (scene.agents, scene.marks):
+            places, radius = group.positions[group.there], group.radius[group.there][:, None]
+            corners += [places - radius, places + radius]
     everything = np.concatenate(corners)
     low, high = everything.min(0), everything.max(0)
     return (low + high) / 2, max(float((high - low).max() / 2), 1e-6)
@@ -215,6 +276,15 @@ def _view(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
 
 def _has_ground(scene: Scene) -> bool:
     return bool((scene.ground[0, 1] > scene.ground[0, 0]).all())
+
+
+def _picture(
+    episode: Episode, size: int, title: str, note: str, words: Words, other: Scene | None = None
+) -> "_Picture | _Photos":
+    """Lay an episode out: as its environment drew it where there is no scene."""
+    if episode.scene is None:
+        return _Photos(episode, size)
+    return _Picture(episode, size, title, note, words, other)
 
 
 class _Photos:
@@ -227,14 +297,23 @@ class _Photos:
         self._size = size, round(size * self._frames.shape[1] / self._frames.shape[2])
 
     def draw(self, t: int) -> Image.Image:
-        """The frame before step t."""
-        return Image.fromarray(self._frames[t]).resize(self._size)
+        """The frame before step t; the last one from the end on."""
+        return Image.fromarray(self._frames[min(t, len(self._frames) - 1)]).resize(self._size)
 
 
 class _Picture:
     """An episode laid out for drawing. The layout is made for a width of 480 pixels and scales with it."""
 
-    def __init__(self, episode: Episode, size: int, title: str = "", note: str = "", words: Words = WORDS) -> None:
+    def __init__(
+        self,
+        episode: Episode,
+        size: int,
+        title: str = "",
+        note: str = "",
+        words: Words = WORDS,
+        other: Scene | None = None,
+    ) -> None:
+        """other: a scene for which there is room as well."""
         if not 120 <= size <= 4096:
             raise ValueError(f"the size of a picture must be between 120 and 4096 pixels, not {size}")
         if episode.scene is None:
@@ -243,7 +322,7 @@ class _Picture:
         self._size, self._unit = size, size / 480
         self._return, self._symbols = episode.return_so_far, episode.symbols
 
-        centre, reach = _view(self._view)
+        centre, reach = _view(self._view, *(() if other is None else (other,)))
         side = size * _SUPERSAMPLING
         self._scale = side * (0.5 - _MARGIN) / reach
         upwards = np.array([1.0, -1.0])
@@ -270,7 +349,8 @@ class _Picture:
             ground.text((right - inset, bottom - inset), "start area", UNCOVERED, small, "rb")
 
     def draw(self, t: int) -> Image.Image:
-        """The frame before step t."""
+        """The frame before step t; once the episode is over its last one."""
+        t = min(t, self.episode.num_steps)
         page = self._page.copy()
         page.paste(self._scene(t), (0, self._header))
         draw, px = ImageDraw.Draw(page), self._px

@@ -7,7 +7,8 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import pytest
 
 from gacrl import export, play, rollout
 from gacrl.config import files as configuration
+from gacrl.config import presets
 from gacrl.evaluation.episodes import Episode
 from gacrl.export import bundle, portable
 from gacrl.export.dictionary import dictionary
@@ -25,6 +27,7 @@ from gacrl.export.html import MOST_BYTES
 from gacrl.export.source import Source
 from gacrl.messages import interventions
 from gacrl.scene import PLAIN, Discs, Scene
+from gacrl.training import build
 from gacrl.training.devices import one_seed
 from gacrl.types import Arrives, Intervention
 
@@ -46,11 +49,25 @@ class Live:
     network: dict[str, Any]
 
 
-def live(name: str, **settings: Any) -> Live:
-    run = play.open_run(name, lambda trained: configuration.changed(trained, settings))
+def live(run: play.TrainedRun) -> Live:
+    assert run.task.world is not None
     world, network = run.task.world(run.env, run.trainer.evaluation_params), portable.network(run)
-    assert network is not None
-    return Live(run, world, network)
+    assert world is not None and network is not None
+    return Live(run, {**world}, network)
+
+
+def shipped(name: str, **settings: Any) -> play.TrainedRun:
+    return play.open_run(f"pretrained:{name}", lambda trained: configuration.changed(trained, settings))
+
+
+def untrained(task: str, network: dict[str, Any], **settings: Any) -> play.TrainedRun:
+    """A policy that has learned nothing is as good a test of what computes it."""
+    config = configuration.on_task(presets.preset("gacrl-talk"), task)
+    algorithm = replace(config.algorithm, network=replace(config.algorithm.network, **network))
+    config = replace(config, algorithm=algorithm, env=replace(config.env, **settings))
+    trainer = build.make_trainer(config, learns=False)
+    learner = trainer.algorithm.init(jax.random.key(0), trainer.algorithm.hyper)
+    return play.TrainedRun("untrained", config, trainer, jax.tree.map(lambda leaf: leaf[None], learner), 0)
 
 
 def recorded(it: Live, num_envs: int = 40) -> dict[str, Any]:
@@ -109,18 +126,19 @@ def in_node(folder: Path, script: str, data: dict[str, Any]) -> dict[str, Any]:
 
 @needs_node
 @pytest.mark.parametrize(
-    ("name", "settings"),
+    "run",
     [
-        ("pretrained:gacrl", {}),
-        ("pretrained:gacrl-teams", {"num_agents": 16, "arena_scale": 1.5}),
-        ("pretrained:gacrl-reference", {}),
-        ("pretrained:gacrl-colours", {}),
+        pytest.param(lambda: shipped("gacrl"), marks=pytest.mark.soak),
+        lambda: shipped("gacrl-teams", num_agents=16, arena_scale=1.5),
+        lambda: shipped("gacrl-reference"),
+        pytest.param(lambda: shipped("gacrl-colours"), marks=pytest.mark.soak),
+        lambda: untrained("speaker_listener", {"latent": "none"}),
+        lambda: untrained("colours", {"speaker_identity": True}, graph="full", named=False),
     ],
+    ids=["gacrl", "teams", "reference", "colours", "speaker_listener", "unnamed"],
 )
-def test_physics_and_policy_are_those_of_jax(
-    tmp_path: Path, quick_start: Any, name: str, settings: dict[str, Any]
-):
-    found = in_node(tmp_path, "parity.js", recorded(live(name, **settings)))
+def test_physics_and_policy_are_those_of_jax(tmp_path: Path, quick_start: Any, run: Callable[[], play.TrainedRun]):
+    found = in_node(tmp_path, "parity.js", recorded(live(run())))
     assert found["steps"] == STEPS
     assert max(found["worst"].values()) < TOLERANCE, found
     assert found["wrong"] == {"words": 0, "actions": 0, "edges": 0}
@@ -153,7 +171,7 @@ def episode(it: Live, intervention: Intervention | None) -> dict[str, Any]:
 @needs_node
 def test_what_happens_to_words_is_what_happens_to_them_in_jax(tmp_path: Path, quick_start: Any):
     """Silence, swapped and late words, and a voice of one's own, over whole episodes; and their links lead back."""
-    it = live("pretrained:gacrl-reference")
+    it = live(shipped("gacrl-reference"))
     spoken = jnp.zeros((2, 2, 16)).at[:, 0].set(jax.nn.one_hot(jnp.array([2, 8]), 16))
     replaced = jnp.zeros((2, 2), bool).at[:, 0].set(True)
     cases = {

@@ -117,7 +117,7 @@ def test_it_plays_and_a_silenced_agent_costs_the_other_its_goal(pages: dict[str,
 
 
 def test_dragged_landmarks_are_followed_and_thirty_agents_fit(pages: dict[str, Path], browser: Any):
-    visit = Visit(browser, pages["gacrl-teams"])
+    visit = Visit(browser, pages["gacrl-teams"], "#seed=1&n=5&at=0")
     page = visit.page
     before = visit.at(20)["main"]
     box = page.locator("#scene").bounding_box()

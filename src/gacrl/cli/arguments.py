@@ -192,7 +192,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Draw episodes as an animated GIF or MP4: what the task shows, who hears whom, and what is said.
+    """Draw episodes as an animated GIF or MP4, or as a strip of moments (PNG): the task, who hears whom, what is said.
 
     MP4 needs ffmpeg. Flags --env.X change the task's settings, as in `gacrl evaluate`.
 
@@ -201,12 +201,13 @@ class Render:
       gacrl render runs/paper-1 --out paper.mp4
       gacrl render oracle --out oracle.gif --episodes 2
       gacrl render runs/gacrl-1 --silence --out silent.gif
+      gacrl render pretrained:gacrl-reference --beside --episodes 2 --out both.png
     """
 
     run: tyro.conf.Positional[str]
     """A run folder, FOLDER@k, FOLDER@best, or a policy by name, as in `gacrl evaluate`."""
     out: Path = field(default=Path("episodes.gif"))
-    """The file to write, .gif or .mp4; one that exists is not overwritten without --overwrite."""
+    """The file to write, .gif, .mp4 or .png; one that exists is not overwritten without --overwrite."""
     episodes: int = 4
     """Episodes to show."""
     horizon: int | None = None
@@ -217,8 +218,11 @@ class Render:
     outside: ON_TASK = Outside()
     sampled: bool = False
     """Explore as in training, instead of playing greedily."""
+    beside: bool = False
+    """Show the run as it is, and beside it the same starts with --silence, --scramble, --drop or --delay; without any
+    of these, silenced."""
     size: int = 480
-    """Width and height in pixels."""
+    """Width and height of a picture in pixels."""
     overwrite: bool = False
     """Replace a file that exists."""
 

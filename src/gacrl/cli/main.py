@@ -26,6 +26,7 @@ from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
     from gacrl.cli.arguments import Evaluate, Messages, Render, Resume, Train
+    from gacrl.experiments.scoring import Recorded
     from gacrl.training.session import Ended
     from gacrl.training.watching import Watcher
     from gacrl.types import Intervention
@@ -38,8 +39,8 @@ usage: gacrl COMMAND [OPTIONS]
   train      train a preset or your own settings into a new run folder
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
-  render     watch a run, random, noop or oracle: a GIF or MP4
-  export     take a run elsewhere: weights, a program, its numbers
+  render     watch a run, random, noop or oracle: a GIF, MP4 or strip of pictures
+  export     take a run elsewhere: weights, a program, a page to play with, its numbers
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
   ablate     every part of GACRL off in turn: what each is worth
@@ -382,16 +383,29 @@ def _render(words: Words) -> int:
     out = asked.out.absolute()  # a task may change the folder of the process
     film.require_format(out)
     change, task = _changes(asked, rest, "render"), words.task or tasks.DEFAULT
+    film.require_rows(out, asked.episodes, asked.beside)
     happens = _intervention(asked.messages)
-    shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, happens)
+
+    def record(intervention: "Intervention | None") -> tuple["Recorded", str]:
+        shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, intervention)
+        return shown, "" if shown.intervention is None else shown.intervention.told
+
+    shown, told = record(None if asked.beside else happens)
     if not shown.episodes[0].visible:
         raise UserError(
             f"{shown.task.name} does not say where things are: give its observations positions, or a scene"
         )
-    told = "" if shown.intervention is None else shown.intervention.told
-    title = f"{told}: {asked.run}" if told else asked.run
-    film.write(shown.episodes, out, size=asked.size, title=title, words=shown.task.words)
-    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}" + (f"; {told}" if told else ""))
+    title, beside, also = f"{told}: {asked.run}" if told else asked.run, None, ""
+    if asked.beside:
+        from gacrl.messages.interventions import silence
+        from gacrl.render import Beside
+
+        with _called("--beside", "the intervention"):
+            other, also = record(silence() if happens is None else happens)
+        beside = Beside(other.episodes, f"{also}: {asked.run}")
+    film.write(shown.episodes, out, asked.size, title, shown.task.words, beside)
+    notes = "".join(f"; {note}" for note in (told, f"beside them {also}" if also else "") if note)
+    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}{notes}")
     return 0
 
 

@@ -1,5 +1,6 @@
 """A run as one page: where the page knows task and network it steps them itself, else it replays what was recorded."""
 
+import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -108,13 +109,9 @@ def _recorded(opened: TrainedRun) -> dict[str, Any]:
 
 
 def _fitting(*groups: list[Episode]) -> int:
-    """How many episodes of each group go into half of a page."""
-    size = sum(_bytes(group[0]) for group in groups if group)
-    return int(np.clip(MOST_BYTES // 2 // max(size, 1), 1, REPLAYED))
-
-
-def _bytes(episode: Episode) -> int:
-    return sum(len(part) for part in map(str, replays.replay([episode])))
+    """How many episodes of each group go into half of a page, by the size of the first."""
+    size = sum(len(json.dumps(replays.replay(group[:1]))) for group in groups)
+    return int(np.clip(MOST_BYTES // 2 // size, 1, REPLAYED))
 
 
 def _episodes(opened: TrainedRun, count: int, intervention: Intervention | None = None) -> list[Episode]:

@@ -27,7 +27,7 @@ export function aboutAgent(frame, index, page, rules) {
 
 function sees(seen, scene, words) {
   const near = (things) => [...things].sort((a, b) => a.squared - b.squared).slice(0, NAMED);
-  const name = (thing, what) => `${what} ${towards(thing.offset)}`;
+  const name = (thing, what) => `${what} ${towards(thing)}`;
   const marks = near(seen.landmarks).map((it) => name(it, markName(scene, it.index, words)));
   const agents = near(seen.agents).map((it) => name(it, `${words.agent} ${it.index}`));
   const rest = seen.landmarks.length + seen.agents.length - marks.length - agents.length;
@@ -77,14 +77,14 @@ export function actionName(page, action) {
 }
 
 export function percent(share) {
-  return `${Math.round(100 * share)} %`;
+  return `${Math.round(100 * share)}\u00a0%`;  // no line ends before the sign
 }
 
 function far(distance) {
   return distance.toFixed(2);
 }
 
-function towards([x, y]) {
+function towards({ x, y }) {
   const distance = Math.hypot(x, y);
   if (distance < 0.1) return "here";
   return `${far(distance)} ${COMPASS[(Math.round(Math.atan2(y, x) / (Math.PI / 4)) + 8) % 8]}`;

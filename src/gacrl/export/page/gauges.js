@@ -1,6 +1,7 @@
 // Numbers of the moment: this run's, those of the untouched one, and those of policies that learn nothing.
 
 import { byId, make } from "./elements.js";
+import { percent } from "./explain.js";
 
 const COLLISIONS = "collisions";
 
@@ -8,7 +9,7 @@ const COLLISIONS = "collisions";
 export function drawGauges(page, session, t) {
   const main = session.main.frames[t], twin = session.meddled ? session.twin.frames[t] : null;
   const names = Object.keys(page.yardsticks), rows = [["Return", (frame) => frame.totals.return, "return", (x) => x.toFixed(1)]];
-  if (main.scene.marks.length > 0) rows.push([capital(page.words.lit), (frame) => frame.share, "share", (x) => `${Math.round(100 * x)} %`]);
+  if (main.scene.marks.length > 0) rows.push([capital(page.words.lit), (frame) => frame.share, "share", percent]);
   if (page.measures[COLLISIONS]) rows.push(["Collisions", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
   const comparable = session.start.count === page.world?.num_agents && main.scene.agents.length === session.start.count;
   const yardsticks = comparable ? names : [];

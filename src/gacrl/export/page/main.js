@@ -18,6 +18,7 @@ import { Voices } from "./voices.js";
 const WORLDS = { spread: SpreadWorld, navigation: NavigationWorld };
 const SPEEDS = [2, 5, 10, 25];  // steps a second
 const WORK = 7;  // milliseconds of each frame for steps to come
+const FIRST = 3;  // the seed that opens a page: a start in which agents with goals have different ones
 const REST = 1800;  // milliseconds between an episode and the next one
 
 const page = JSON.parse(byId("data").textContent);
@@ -32,7 +33,7 @@ function open() {
   }
   const world = new WORLDS[page.world.kind](page.world), policy = policyFrom(page.network);
   const asked = understood(location.hash, world, policy);
-  const start = asked === null ? { seed: 1, count: page.world.num_agents } : { seed: asked.seed, count: asked.count };
+  const start = asked === null ? { seed: FIRST, count: page.world.num_agents } : { seed: asked.seed, count: asked.count };
   return { session: new Session(world, policy, start, asked?.events ?? []), asked };
 }
 
@@ -160,7 +161,8 @@ const act = {
   },
   copy() {
     write();
-    navigator.clipboard?.writeText(location.href).then(() => say(byId("copied"), "copied"), () => say(byId("copied"), "copy it from the address bar"));
+    const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
+    copied.then(() => say(byId("copied"), "copied"), () => say(byId("copied"), "copy it from the address bar"));
   },
 };
 

@@ -13,12 +13,16 @@ export function offsetBetween(a, i, b, j) {
   return [b[2 * j] - a[2 * i], b[2 * j + 1] - a[2 * i + 1]];
 }
 
-// The things at these places as agent i sees them; features: what is known of them besides.
-export function thingsAround(positions, i, places, features = () => []) {
-  return Array.from({ length: places.length / 2 }, (_, index) => {
-    const offset = offsetBetween(positions, i, places, index);
-    return { index, offset, squared: offset[0] * offset[0] + offset[1] * offset[1], features: features(index) };
-  });
+const NO_FEATURES = new Float64Array(0);
+
+// The things at these places as agent i sees them: how far to the right and up, and what is known of them besides.
+export function thingsAround(positions, i, places, features = () => NO_FEATURES) {
+  const things = [];
+  for (let index = 0; index < places.length / 2; index++) {
+    const x = places[2 * index] - positions[2 * i], y = places[2 * index + 1] - positions[2 * i + 1];
+    things.push({ index, x, y, squared: x * x + y * y, features: features(index) });
+  }
+  return things;
 }
 
 // The force of each agent's own action, flat.

@@ -81,7 +81,7 @@ export class Policy {
     const width = torso.attention.columns;
     const shares = softmax(places.map((place) => dot(torso.attention.weight, place)));
     const best = places.reduce(raise, new Float64Array(width));
-    const others = agents.map((other) => mlp(torso.agent, concat(one.own, scales(other.offset), other.features)));
+    const others = agents.map((other) => mlp(torso.agent, concat(one.own, scales(other.x, other.y), other.features)));
     const crowd = others.reduce(raise, new Float64Array(torso.agent.at(-1).rows));
     const hidden = mlp(torso.out, concat(one.own, mixture(places, shares, width), best, crowd));
     if (this.code === null) return { hidden, code: null, places, landmarks };
@@ -92,16 +92,16 @@ export class Policy {
 
   // The vector of a landmark, for an agent that sees these others: who else stands how near to it.
   place(own, landmark, agents) {
-    const { rival } = this.torso, [x, y] = landmark.offset, pair = new Float64Array(rival.rows);
-    const mine = affine(rival, concat(scales([-x, -y]), landmark.features), undefined, SCALES);
+    const { rival } = this.torso, { x, y } = landmark, pair = new Float64Array(rival.rows);
+    const mine = affine(rival, concat(scales(-x, -y), landmark.features), undefined, SCALES);
     const contest = new Float64Array(rival.rows);
     for (const other of agents) {
       pair.set(mine);
-      addProduct(rival, scales([other.offset[0] - x, other.offset[1] - y]), pair);
-      addProduct(rival, other.features, pair, 2 * SCALES + landmark.features.length);
+      addProduct(rival, scales(other.x - x, other.y - y), pair);
+      if (other.features.length > 0) addProduct(rival, other.features, pair, 2 * SCALES + landmark.features.length);
       raise(contest, rectify(pair));
     }
-    return mlp(this.torso.landmark, concat(own, scales(landmark.offset), landmark.features, contest));
+    return mlp(this.torso.landmark, concat(own, scales(x, y), landmark.features, contest));
   }
 
   // Whom an agent hears: its nearest ones, where the network listens to so many.
@@ -116,7 +116,7 @@ export class Policy {
   listen(round, hidden, one, speakers, words) {
     const { edge, query, merge } = this.talk[round], { vocabulary, heard_slope, speaker_identity } = this.settings;
     const edges = speakers.map((j) => {
-      const known = speaker_identity ? [...sighted(one.sight(j)), ...oneHot(j, this.settings.num_agents)] : sighted(one.sight(j));
+      const known = speaker_identity ? concat(sighted(one.sight(j)), oneHot(j, this.settings.num_agents)) : sighted(one.sight(j));
       const heard = affine(edge, known, undefined, vocabulary);
       for (let k = 0; k < heard.length; k++) heard[k] += edge.weight[k * edge.columns + words[j]];  // the word stands first
       return rectify(heard, heard_slope);
@@ -140,22 +140,20 @@ export class Policy {
 
 function nearest(things, count) {
   if (count === null || things.length <= count) return things;
-  return [...things].sort((a, b) => a.squared - b.squared).slice(0, count);
-}
-
-// An offset and its length, which is never quite 0.
-function withLength([x, y]) {
-  return [x, y, Math.sqrt(x * x + y * y + 1e-8)];
+  const farthest = Float64Array.from(things, (thing) => thing.squared).sort()[count - 1];
+  return things.filter((thing) => thing.squared <= farthest).slice(0, count);
 }
 
 // What one sees of another as numbers for a network; nothing of those that it does not see.
 function sighted(sight) {
-  return sight.length === 0 ? [] : [...withLength(sight), ...sight.slice(2)];
+  if (sight.length === 0) return sight;
+  const [x, y, ...features] = sight;
+  return Float64Array.of(x, y, Math.sqrt(x * x + y * y + 1e-8), ...features);
 }
 
 // The offset, its length, and the offset near by magnified.
-function scales(offset) {
-  return [...withLength(offset), Math.tanh(offset[0] / NEAR), Math.tanh(offset[1] / NEAR)];
+function scales(x, y) {
+  return Float64Array.of(x, y, Math.sqrt(x * x + y * y + 1e-8), Math.tanh(x / NEAR), Math.tanh(y / NEAR));
 }
 
 // A policy out of the page's data: {settings, tensors: {name: [rows, first, size]}, data: base64 of float32}.

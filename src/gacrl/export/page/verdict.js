@@ -1,5 +1,6 @@
 // One sentence on what meddling with the words has done so far.
 
+import { percent } from "./explain.js";
 import { FATES } from "./words.js";
 
 export function verdict(page, session, t) {
@@ -12,7 +13,7 @@ export function verdict(page, session, t) {
   const how = kinds.map((kind) => (kind === "speak" ? "spoken for by you" : FATES[kind].label)).join(" and ");
   const done = agents.length > 0 ? `${who} ${agents.length > 1 && !all ? "are" : "is"} ${how}` : "Who hears whom is changed";
   if (t < 3) return `${done}. Watch both pictures.`;
-  const gap = main.totals.return - twin.totals.return, share = (frame) => `${Math.round(100 * frame.share)} %`;
+  const gap = main.totals.return - twin.totals.return, share = (frame) => percent(frame.share);
   const goals = main.scene.marks.length > 0 ? ` ${share(main)} of the ${page.words.mark}s ${page.words.lit}, untouched ${share(twin)}.` : "";
   if (Math.abs(gap) < 0.05) return `${done}: so far nothing has changed.${goals}`;
   return `${done}: ${Math.abs(gap).toFixed(1)} points ${gap < 0 ? "worse" : "better"} than untouched after ${t} steps.${goals}`;
