@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gacrl.adapters.jaxmarl import to_jaxmarl
     from gacrl.adapters.pettingzoo import to_pettingzoo
     from gacrl.algorithms.contract import Algorithm
     from gacrl.api import Run, Trainer, evaluate, iterate, make_env, train, trainer
@@ -56,6 +57,7 @@ _HOMES = {
     "scramble": "gacrl.messages.interventions",
     "silence": "gacrl.messages.interventions",
     "swap": "gacrl.messages.interventions",
+    "to_jaxmarl": "gacrl.adapters.jaxmarl",
     "to_pettingzoo": "gacrl.adapters.pettingzoo",
     "train": "gacrl.api",
     "trainer": "gacrl.api",
@@ -90,6 +92,7 @@ __all__ = [  # the keys of _HOMES, spelled out for type checkers
     "scramble",
     "silence",
     "swap",
+    "to_jaxmarl",
     "to_pettingzoo",
     "train",
     "trainer",

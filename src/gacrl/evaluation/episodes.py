@@ -218,14 +218,16 @@ def record_many(
     num_episodes: int,
     intervention: Intervention | None = None,
     look: Look | None = None,
+    pictures: bool = True,
 ) -> list[Episode]:
     """K episodes, each up to its end: the very episodes that `evaluate` measures with the same arguments.
 
     look: what is to be seen of a state; without it discs, where the task says where its agents are. An environment that
-    lives in Python draws its own pictures.
+    lives in Python draws its own pictures, unless nobody wants `pictures`.
     """
     if isinstance(env, Hosted):
-        return _record_on_host(env, on_host.actors(env, policy, initial_memory, intervention), key, num_episodes)
+        playing = on_host.actors(env, policy, initial_memory, intervention)
+        return _record_on_host(env, playing, key, num_episodes, pictures)
 
     @jax.jit
     def program(memory: Memory, params: EnvParams, key: PRNGKey) -> Played:
@@ -286,7 +288,9 @@ _FRAMES_BYTES = 256 * 2**20
 _FRAMES_WIDTH = 480
 
 
-def _record_on_host(env: Hosted, playing: on_host.Actors, key: PRNGKey, num_episodes: int) -> list[Episode]:
+def _record_on_host(
+    env: Hosted, playing: on_host.Actors, key: PRNGKey, num_episodes: int, pictures: bool
+) -> list[Episode]:
     """The same, of an environment that lives in Python, with the pictures that it draws."""
     room = _FRAMES_BYTES / (num_episodes * (env.max_cycles + 1))
     width = min(_FRAMES_WIDTH, int((room / 3) ** 0.5))
@@ -297,7 +301,7 @@ def _record_on_host(env: Hosted, playing: on_host.Actors, key: PRNGKey, num_epis
         def look(copies: Copies, frames: list[Any] = frames) -> None:
             frames.append(copies.pictures(width))
 
-        moments = list(on_host.play(env, playing, key, episodes, look))
+        moments = list(on_host.play(env, playing, key, episodes, look if pictures else None))
         steps = rollout.happened(
             *_stacked([(moment.decided, moment.decision, moment.after) for moment in moments])
         )

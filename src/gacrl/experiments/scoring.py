@@ -172,6 +172,7 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
         opened.trainer.evaluation_params,
         _HEARD,
         opened.trainer.intervention,
+        pictures=False,
     )
     conversations = env.num_symmetries if config.symmetric_play else 1
     choices = network.vocabulary + network.gate  # with a gate also to say nothing
@@ -225,8 +226,10 @@ def _record(
     episodes: int,
     intervention: Intervention | None = None,
     look: recording.Look | None = None,
+    pictures: bool = True,
 ) -> list[recording.Episode]:
-    return recording.record_many(env, policy, memory, params, stream_key("report"), episodes, intervention, look)
+    key = stream_key("report")
+    return recording.record_many(env, policy, memory, params, key, episodes, intervention, look, pictures)
 
 
 def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: Backend) -> dict[str, np.ndarray]:

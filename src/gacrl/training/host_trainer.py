@@ -70,21 +70,17 @@ class HostTrainer(AbstractTrainer):
 
     def compiled(self, state: TrainState, num_updates: int) -> Chunk:
         """Play and learn once, of a copy of the first seed: each program is compiled when it is first called."""
-        jax.block_until_ready(self._chunk_of_one(one_seed(state, 0), 1, self._standing(0)))
+        jax.block_until_ready(self._chunk_of_one(one_seed(state, 0), 1, self._standing(0), anew=True))
         self._latest = None
         return self._chunk
 
     def _chunk(self, state: TrainState, num_updates: int) -> tuple[TrainState, ChunkReport]:
         """`num_updates` turns of the loop, for each seed in turn."""
-        goes_on = state is self._latest
-        done: list[tuple[TrainState, ChunkReport]] = []
-        for seed in range(self.num_seeds):
-            stage = self._stages.get(seed) if goes_on else None
-            done.append(
-                self._chunk_of_one(
-                    one_seed(state, seed), num_updates, stage or self._standing(seed), stage is None
-                )
-            )
+        anew, self._latest = state is not self._latest, None
+        done = [
+            self._chunk_of_one(one_seed(state, seed), num_updates, self._standing(seed), anew)
+            for seed in range(self.num_seeds)
+        ]
         self._latest, report = shard_seeds(stack_seeds(done), self.mesh)
         assert self._latest is not None
         return self._latest, report
@@ -97,7 +93,7 @@ class HostTrainer(AbstractTrainer):
         return self._stages[seed]
 
     def _chunk_of_one(
-        self, state: TrainState, num_updates: int, stage: Stage, anew: bool = True
+        self, state: TrainState, num_updates: int, stage: Stage, anew: bool
     ) -> tuple[TrainState, ChunkReport]:
         """anew: begin with new episodes."""
         if anew:

@@ -1,11 +1,11 @@
 """JaxMARL's environments as tasks: compiled as our own are, with its rewards and its lengths of episodes."""
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from importlib import import_module
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,8 @@ def _made(name: str, arguments: dict[str, Any]) -> Any:
     try:
         return import_module("jaxmarl").make(name.removeprefix(SCHEME), **arguments)
     except ImportError as error:
-        raise ConfigError(f"--env {name}: {error}; install it with `pip install jaxmarl`") from error
+        hint = "; install it with `pip install jaxmarl`" if error.name == "jaxmarl" else ""
+        raise ConfigError(f"--env {name}: {error}{hint}") from error
     except Exception as error:
         raise ConfigError(f"--env {name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
 
@@ -55,7 +56,12 @@ def _made(name: str, arguments: dict[str, Any]) -> Any:
 def _task_of(name: str, env: Any, max_steps: int | None) -> "JaxmarlTask":
     """Look an environment over."""
     agents = list(env.agents)
-    seen = {agent: _as_box(env.observation_space(agent)) for agent in agents}
+    shown = jax.eval_shape(env.reset, jax.random.key(0))[0]
+    if not isinstance(shown, Mapping) or not set(agents) <= set(shown):
+        raise ConfigError(
+            f"{name} does not name its agents in what it shows: wrap it in an environment of your own"
+        )
+    seen = {agent: _space_of(shown[agent]) for agent in agents}
     layout = lay_out(name, agents, seen, {agent: env.action_space(agent) for agent in agents})
     if not all(layout.plain):
         raise ConfigError(f"{name} has actions of several parts: gacrl takes those of JaxMARL that are Discrete")
@@ -65,13 +71,16 @@ def _task_of(name: str, env: Any, max_steps: int | None) -> "JaxmarlTask":
     return JaxmarlTask(name, env, layout, int(steps) + 1, _masks(env))
 
 
-def _as_box(space: Any) -> Any:
-    """Its spaces have the same names as Gymnasium's; layers of ones and zeros are no picture."""
-    kind = type(space).__name__
-    if kind != "Box":
-        return space
-    shape = tuple(np.atleast_1d(space.shape).tolist())
-    return type("Box", (SimpleNamespace,), {})(shape=shape, dtype=np.dtype(np.float32))
+class Box(NamedTuple):
+    """What an agent sees; layers of ones and zeros are no picture."""
+
+    shape: tuple[int, ...]
+    dtype: Any = np.dtype(np.float32)
+
+
+def _space_of(shown: Any) -> Any:
+    """Read what an agent sees from what it is shown: its spaces do not always say it."""
+    return Box(shown.shape) if hasattr(shown, "shape") else shown
 
 
 def _masks(env: Any) -> bool:
@@ -90,11 +99,10 @@ def _masks(env: Any) -> bool:
 class JaxmarlTask(Environment):
     """An environment of JaxMARL.
 
-    Its episodes have up to `max_steps` + 1 steps: it looks at the clock before it counts. It does not tell a time limit
-    from an end; the last step that an episode can have counts as the limit here.
+    Its episodes may have `max_steps` + 1 steps, where it looks at the clock before it counts. It does not tell a time
+    limit from an end: an episode that is over after `max_steps` counts as truncated here.
     """
 
-    continuous_actions: ClassVar[bool] = False
     task: str
     env: Any
     layout: Layout
@@ -134,7 +142,7 @@ class JaxmarlTask(Environment):
         reward = jnp.stack([jnp.asarray(rewards[agent], jnp.float32).reshape(()) for agent in agents])
         done = jnp.stack([jnp.asarray(dones[agent], bool).reshape(()) for agent in agents])
         over = jnp.asarray(dones["__all__"], bool).reshape(())
-        limit = clock >= self.max_cycles
+        limit = clock >= self.max_cycles - 1
         mean = jnp.where(there, reward, 0.0).sum() / jnp.maximum(there.sum(), 1)
         left = there & done & ~over
         still = there & ~left
@@ -142,7 +150,7 @@ class JaxmarlTask(Environment):
             observation=self._observation(seen, inner, still),
             reward=jnp.where(there, reward, 0.0),
             terminated=over & ~limit,
-            truncated=limit,
+            truncated=(over & limit) | (clock >= self.max_cycles),
             info={"reward_raw": mean},
             left=left,
         )

@@ -66,7 +66,7 @@ def lay_out(task: str, agents: Sequence[str], seen: Mapping[str, Any], does: Map
     shapes = [_shape(task, agent, seen[agent]) for agent in agents]
     parts = [_parts(task, agent, does[agent]) for agent in agents]
     kinds = [
-        (re.sub(r"_?\d+$", "", agent), shape, part)
+        (re.sub(r"_?\d+$", "", str(agent)), shape, part)
         for agent, shape, part in zip(agents, shapes, parts, strict=True)
     ]
     known = list(dict.fromkeys(kinds))

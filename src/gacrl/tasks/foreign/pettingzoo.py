@@ -229,9 +229,9 @@ def _require_parallel(task: str, env: Any) -> None:
 
 def _horizon(task: str, env: Any, asked: int | None) -> int:
     """Steps of an episode: as asked for, or as the environment says."""
-    told = [getattr(of, "max_cycles", None) for of in (env, env.unwrapped)]
-    inner = getattr(env.unwrapped, "env", None)  # as the environments of SISL keep theirs
-    told.append(getattr(inner, "max_cycles", None))
+    bare = getattr(env, "unwrapped", env)
+    inner = getattr(bare, "env", None)  # as the environments of SISL keep theirs
+    told = [getattr(of, "max_cycles", None) for of in (env, bare, inner)]
     steps = next((steps for steps in (asked, *told) if steps is not None), None)
     if steps is None:
         raise ConfigError(

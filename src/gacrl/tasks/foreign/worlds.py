@@ -79,6 +79,14 @@ class World:
         self._end(ended, cut, len(acting))
         self._see(seen, infos, self.there)
 
+    def picture(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """Draw where things are; None where the environment draws nothing. Raises Faulty."""
+        if getattr(self.env, "render_mode", None) is None:
+            return None
+        with self._blamed("render"):
+            drawn = self.env.render()
+        return drawn if isinstance(drawn, np.ndarray) else None
+
     def _end(self, ended: list[int], cut: list[int], acting: int) -> None:
         """End the lives of these agents, who were terminated or truncated; with the last of them ends the episode."""
         over = len(ended) + len(cut) == acting or self.clock >= self.max_cycles
@@ -208,10 +216,8 @@ class Worlds(Copies):
 
     def pictures(self, width: int) -> list[UInt8[np.ndarray, "height width 3"]] | None:
         """Draw every environment; None where one draws nothing."""
-        drawn = [world.env.render() for world in self._worlds if world.env.render_mode is not None]
-        if len(drawn) < len(self._worlds) or any(not isinstance(picture, np.ndarray) for picture in drawn):
-            return None
-        return [_at_most(picture, width) for picture in drawn]
+        drawn = [picture for world in self._worlds if (picture := world.picture()) is not None]
+        return [_at_most(picture, width) for picture in drawn] if len(drawn) == len(self._worlds) else None
 
     def close(self) -> None:
         """Close the environments."""
