@@ -4,6 +4,7 @@ import functools
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -55,6 +56,14 @@ SHORT = RunConfig(
 """Ten updates, three to a chunk."""
 
 
+def nothing_played(self: Trainer, *_: Any) -> dict[str, np.ndarray]:
+    """Stand in for `Trainer.evaluate`, a program that may be compiled ahead."""
+    return dict.fromkeys(self.table.names, np.zeros((1, 2)))
+
+
+vars(nothing_played)["lower"] = lambda *_: SimpleNamespace(compile=lambda: None)
+
+
 def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -62,7 +71,7 @@ def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     folder = tmp_path / "run"
     monkeypatch.setattr(build.build_algorithm, "make", lambda *_: breaking(at=5, loss=2.0))
     monkeypatch.setattr(session, "make_trainer", functools.cache(build.make_trainer))
-    monkeypatch.setattr(Trainer, "evaluate", lambda self, *_: dict.fromkeys(self.table.names, np.zeros((1, 2))))
+    monkeypatch.setattr(Trainer, "evaluate", nothing_played)
     with pytest.raises(Diverged) as stopped:
         session.start(SHORT, folder)
     assert str(stopped.value) == (

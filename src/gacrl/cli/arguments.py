@@ -41,8 +41,8 @@ class Outside:
     """What does not come with the package; both are taken before anything else is understood."""
 
     env: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task: a name (`gacrl tasks`); FILE.py:NAME, a Task or an Environment, whose file is run; pettingzoo:MODULE, a
-    module with `parallel_env`; or jaxmarl:NAME."""
+    """The task: a name (`gacrl tasks`), pettingzoo:MODULE, jaxmarl:NAME, or FILE.py:NAME, which is a Task or an
+    Environment; that file is run."""
     use: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
     """A Python file to run first: it adds messages, exploration rules or algorithms (examples/)."""
 
