@@ -41,18 +41,19 @@ def compiled() -> Iterator[Counter[str]]:
     log.removeHandler(handler)
 
 
-def test_a_run_compiles_each_of_its_programs_once(tmp_path: Path, compiled: Counter[str]):
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_run_compiles_each_of_its_programs_once(seeds: int, tmp_path: Path, compiled: Counter[str]):
     """What is compiled ahead is what is called later: another layout, and XLA would compile it again, unseen."""
     small = {
         "algorithm": {"network": {"width": 8}},
         "training": {"env_steps": 40, "num_envs": 2, "num_steps": 5},
         "evaluation": {"interval": 20, "num_episodes": 2, "final_episodes": 3},
     }
-    config = replace(configuration.from_dict(small, gacrl.preset("ippo")), num_seeds=2)
+    config = replace(configuration.from_dict(small, gacrl.preset("ippo")), num_seeds=seeds)
     session.start(config, tmp_path / "run")
     assert compiled["on_all_devices"] == compiled["record"] == 1, compiled
     assert compiled["evaluate"] == 4, compiled  # greedy and sampled, along the way and at the end
-    assert compiled["play"] == 3, compiled  # random, noop and oracle
+    assert compiled["play"] == (3 if seeds == 1 else 0), compiled  # random, noop and oracle, once a process
 
 
 def test_what_lowering_raises_is_raised_to_whoever_waits():

@@ -74,7 +74,8 @@ class Ahead:
 class Programs:
     """The programs of a training, being compiled."""
 
-    chunk: tuple[Future[Any], ...] = ()
+    chunk: Future[Any] | None = None
+    """A chunk of any length; None: nobody compiles it."""
     monitor: tuple[Future[Any], ...] = ()
     """The evaluations along the way."""
 
@@ -101,7 +102,7 @@ def prepare(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig, fresh: bo
     )
     if start is not None:
         start.result()
-    return Programs((chunk,), monitor)
+    return Programs(chunk, monitor)
 
 
 def closing(trainer: Trainer, config: RunConfig) -> tuple[Lower, ...]:

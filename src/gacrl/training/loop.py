@@ -91,8 +91,7 @@ def train(
         updates = min(config.updates_per_chunk, total - done)
         if chunk is None:
             begun = time.perf_counter()
-            wait(programs.chunk)
-            chunk = trainer.compiled(state, updates)
+            chunk = trainer.compiled(state, updates) if programs.chunk is None else programs.chunk.result()
             compiling += time.perf_counter() - begun
             wait_for_all()
         begun = time.perf_counter()

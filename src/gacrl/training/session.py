@@ -196,11 +196,13 @@ def _to_the_end(
 ) -> Ended:
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     watcher.compiling()
+    begin = time.perf_counter()
     programs = prepare(ahead, trainer, config, fresh=found is None and begun is None)
     ending = partial(_prepare_ending, ahead, trainer, config)
     if isinstance(trainer, Trainer):  # what lives in Python plays one thing at a time
         ending = ahead.run(ending).result
     state = restore(trainer, config, found) if begun is None else shard_seeds(begun, trainer.mesh)
+    clock = replace(clock, compiling=clock.compiling + time.perf_counter() - begin)
     with folder.writing(config.task):
         if leads():
             folder.diverged_file.unlink(missing_ok=True)
