@@ -205,7 +205,10 @@ def test_a_policy_is_saved_without_what_only_learning_needs(run: Path, observati
 
 
 def test_pretrained_policies_have_names():
-    assert set(play.pretrained()) == {"gacrl", "gacrl-112k", "gacrl-teams", "gacrl-reference", "gacrl-colours"}
+    assert set(play.pretrained()) == {
+        *("gacrl", "gacrl-112k", "gacrl-teams"),
+        *("gacrl-reference", "gacrl-colours", "gacrl-traffic"),
+    }
     with pytest.raises(gacrl.UserError, match="unknown pretrained policy 'nobody'"):
         gacrl.load_policy("pretrained:nobody")
 
