@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep, observe
+from gacrl.envs.environment import EnvParams, EnvState, TimeStep, observe
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
-from gacrl.tasks.foreign.layout import Layout, lay_out
+from gacrl.tasks.foreign.layout import Layout, Padded, lay_out
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
 
@@ -96,7 +96,7 @@ def _masks(env: Any) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class JaxmarlTask(Environment):
+class JaxmarlTask(Padded):
     """An environment of JaxMARL.
 
     Its episodes may have `max_steps` + 1 steps, where it looks at the clock before it counts. It does not tell a time
@@ -108,21 +108,6 @@ class JaxmarlTask(Environment):
     layout: Layout
     max_cycles: int
     masks: bool
-
-    @property
-    def num_agents(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """N."""
-        return len(self.layout.agents)
-
-    @property
-    def num_actions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A: the most that an agent has."""
-        return self.layout.mask.shape[1]
-
-    @property
-    def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """O: the most that an agent sees, and its role."""
-        return self.layout.observation_size
 
     def reset(self, key: PRNGKey, params: EnvParams = ()) -> tuple[EnvState, Observation]:
         """Begin an episode."""

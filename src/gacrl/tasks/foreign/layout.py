@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gacrl.envs.environment import Environment
 from gacrl.errors import ConfigError
 
 MOST_CHOICES = 64
@@ -59,6 +60,27 @@ class Layout:
             return choice + self.starts[agent][0]
         parts = np.unravel_index(choice, self.choices[agent])
         return np.array(parts, np.int64) + np.array(self.starts[agent])
+
+
+class Padded(Environment):
+    """An environment whose agents are laid out: its sizes."""
+
+    layout: Layout
+
+    @property
+    def num_agents(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """N: those that learn."""
+        return len(self.layout.agents)
+
+    @property
+    def num_actions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """A: the most that an agent has."""
+        return self.layout.mask.shape[1]
+
+    @property
+    def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """O: the most that an agent sees, and its role."""
+        return self.layout.observation_size
 
 
 def lay_out(task: str, agents: Sequence[str], seen: Mapping[str, Any], does: Mapping[str, Any]) -> Layout:

@@ -17,7 +17,7 @@ from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
-from gacrl.tasks.foreign.layout import Layout, lay_out
+from gacrl.tasks.foreign.layout import Layout, Padded, lay_out
 from gacrl.tasks.foreign.worlds import Scripted, World, Worlds
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
@@ -136,7 +136,7 @@ def _task(name: str, maker: _Maker, scripted: Scripted) -> Task:
 
 
 @dataclass(frozen=True, eq=False)
-class Zoo(Hosted):
+class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride]
     """A PettingZoo environment for those of its agents that learn."""
 
     task: str
@@ -164,21 +164,6 @@ class Zoo(Hosted):
         steps = _horizon(task, env, settings.max_cycles)
         env.close()
         return cls(task, maker, settings, layout, steps, scripted)
-
-    @property
-    def num_agents(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """N: those that learn."""
-        return len(self.layout.agents)
-
-    @property
-    def num_actions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A: the most that an agent has."""
-        return self.layout.mask.shape[1]
-
-    @property
-    def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """O: the most that an agent sees, and its role."""
-        return self.layout.observation_size
 
     def open(self, copies: int, seen: bool = False) -> Copies:
         """Make so many environments."""
