@@ -80,12 +80,6 @@ class Programs:
     """The evaluations along the way."""
 
 
-def wait(programs: tuple[Future[Any], ...]) -> None:
-    """Return when they are compiled. Raises what lowering or compiling raised."""
-    for program in programs:
-        program.result()
-
-
 def prepare(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig, fresh: bool = False) -> Programs:
     """Begin to compile what training needs; nothing where the environments live in Python.
 

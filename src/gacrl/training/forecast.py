@@ -1,5 +1,7 @@
 """How much longer a run will take, judged by how long its parts have taken so far."""
 
+import math
+
 _SECONDS_A_FRAME = 0.006
 """Of a picture that is 480 pixels wide, on one core."""
 
@@ -16,8 +18,10 @@ def closing_seconds(playing: float, more_episodes: float, frames: int) -> float:
 def seconds_left(
     env_steps: int, steps_per_second: float, evaluations: int, playing: float, closing: float
 ) -> float:
-    """Chunks, the evaluations after them, and what closes the run; NaN where nothing was timed.
+    """Chunks, the evaluations after them, and what closes the run, in whole seconds; NaN where nothing was timed.
 
     env_steps: that all seeds have still to take. evaluations: that are still to come.
     """
-    return env_steps / steps_per_second + evaluations * playing + closing if steps_per_second > 0 else float("nan")
+    if not steps_per_second > 0:
+        return math.nan
+    return float(math.ceil(env_steps / steps_per_second + evaluations * playing + closing))

@@ -15,7 +15,7 @@ from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.metrics import EpisodeSummary
 from gacrl.render import num_frames
-from gacrl.training.ahead import Ahead, Programs, prepare, wait
+from gacrl.training.ahead import Ahead, Programs, prepare
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task
 from gacrl.training.forecast import closing_seconds, seconds_left
@@ -101,7 +101,8 @@ def train(
         timed += updates * per_update * len(config.seeds)
         done += updates
         begun = time.perf_counter()
-        wait(programs.monitor)
+        for program in programs.monitor:
+            program.result()
         compiling += time.perf_counter() - begun
         begun = time.perf_counter()
         evaluations = {

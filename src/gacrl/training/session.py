@@ -79,9 +79,9 @@ def start(
     begun = None if parent is None else begin_with(trainer, config, parent)
     name = None if parent is None else parent.name
     folder = RunFolder.create(out, config, name) if leads() else RunFolder(out or Path("runs"))
-    with folder.locked() if leads() else nullcontext():
+    with folder.locked() if leads() else nullcontext(), Ahead() as ahead:
         watcher.planned(folder, config, planned)
-        return _run(folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
+        return _run(ahead, folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
 
 
 def begin_with(trainer: AbstractTrainer, config: RunConfig, parent: Parent) -> TrainState:
@@ -113,7 +113,7 @@ def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | N
     watcher = watcher or Watcher()
     extend = None if extend is None else whole(extend, "extend", 1)
     folder = RunFolder.open(path)
-    with folder.locked() if leads() else nullcontext():
+    with folder.locked() if leads() else nullcontext(), Ahead() as ahead:
         folder.require_room()
         config = folder.config()
         folder.warn_of_changed_task(watcher.warn)
@@ -135,7 +135,7 @@ def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | N
             folder.extend(config.training.env_steps)
         watcher.planned(folder, config, planned)
         fingerprint = configuration.fingerprint(folder.settings())
-        return _run(folder, config, trainer, found, watcher, fingerprint)
+        return _run(ahead, folder, config, trainer, found, watcher, fingerprint)
 
 
 def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
@@ -171,6 +171,7 @@ def restore(trainer: AbstractTrainer, config: RunConfig, found: checkpoint.Check
 
 
 def _run(
+    ahead: Ahead,
     folder: RunFolder,
     config: RunConfig,
     trainer: AbstractTrainer,
@@ -180,20 +181,6 @@ def _run(
     begun: TrainState | None = None,
 ) -> Ended:
     """begun: the state to begin with, stacked, where it is not a fresh one."""
-    with Ahead() as ahead:
-        return _to_the_end(ahead, folder, config, trainer, found, watcher, fingerprint, begun)
-
-
-def _to_the_end(
-    ahead: Ahead,
-    folder: RunFolder,
-    config: RunConfig,
-    trainer: AbstractTrainer,
-    found: checkpoint.Checkpoint | None,
-    watcher: Watcher,
-    fingerprint: str,
-    begun: TrainState | None,
-) -> Ended:
     env_steps, clock = (0, Clock()) if found is None else (found.env_steps, _clock(found))
     watcher.compiling()
     begin = time.perf_counter()

@@ -172,7 +172,7 @@ class AbstractTrainer(ABC):
 
     def lower_init(self, seed: int) -> Any:
         """Lower what makes a fresh training state, to be compiled ahead."""
-        return Trainer._init.lower(self, stream_key("training", seed), self.algorithm.hyper, self.params)
+        return AbstractTrainer._init.lower(self, stream_key("training", seed), self.algorithm.hyper, self.params)
 
     @partial(jax.jit, static_argnums=0)
     def _init(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams) -> TrainState:
