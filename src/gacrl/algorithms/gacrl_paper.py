@@ -35,7 +35,7 @@ from gacrl.messages import interventions
 from gacrl.networks.arrives import arriving
 from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
 from gacrl.networks.graph import heard_adjacency, neighbour_sum
-from gacrl.networks.layers import Linear
+from gacrl.networks.layers import Linear, redrawn
 from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel
 from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
@@ -392,6 +392,7 @@ def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
         PolicyNetwork(policy_input, config.policy_hidden, p.env.num_actions, policy_key),
         Critic(observation_size * num_agents, config.critic_hidden, critic_key),
     )
+    network = redrawn(network, key)
     packed_size, _ = ring.packing(partial(no_experience, p))
     return LearnerState(
         network=network,

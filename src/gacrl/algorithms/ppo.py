@@ -33,6 +33,7 @@ from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
 from gacrl.networks.critic import Critic, View
+from gacrl.networks.layers import redrawn
 from gacrl.networks.memory import beginnings, restarted
 from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
@@ -159,7 +160,7 @@ def networks(p: Setup, key: PRNGKey) -> Network:
 
 def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
     """A learner that has learned nothing."""
-    network = networks(p, key)
+    network = redrawn(networks(p, key), key)
     return LearnerState(
         network=network,
         optimizer=p.adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree

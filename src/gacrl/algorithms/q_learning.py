@@ -31,6 +31,7 @@ from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.messages import interventions
 from gacrl.networks.agent import AgentNetwork, AgentOutput, matched, unroll, words_said
+from gacrl.networks.layers import redrawn
 from gacrl.networks.memory import beginnings, restarted
 from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
 
@@ -212,7 +213,7 @@ def acting(learner: LearnerState) -> LearnerState:
 
 def init(q: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
     """A learner that has learned nothing."""
-    network = q.parts.networks(key)
+    network = redrawn(q.parts.networks(key), key)
     return LearnerState(
         network=network,
         target=network,
