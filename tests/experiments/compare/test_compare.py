@@ -24,7 +24,7 @@ from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison, Pair, compare
 from gacrl.experiments.compare.data import to_dict, to_marl_eval
 from gacrl.experiments.compare.marl_eval import from_marl_eval
-from gacrl.experiments.compare.report import write_page
+from gacrl.experiments.compare.pages import write_page
 
 REFERENCES = {
     who: {"return_agent_mean": value, "coverage_final_0.1": coverage, "collisions": 1.0}
