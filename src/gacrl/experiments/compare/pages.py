@@ -1,5 +1,6 @@
-"""A comparison as a page: the tables of the terminal, and figures."""
+"""A comparison as a page: numbers, figures, episodes, settings, and the commands that repeat it."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,13 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gacrl import tasks
+from gacrl.config import files as configuration
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison
+from gacrl.experiments.compare.exploring import progress_metric, ways
+from gacrl.experiments.compare.finished import Finished
 from gacrl.experiments.compare.groups import Group
-from gacrl.experiments.compare.report import about, explained, listings, titled
+from gacrl.experiments.compare.report import about, everything, explained, listings, titled
+from gacrl.export import bundle
+from gacrl.training.recorder import RunFolder
 
 if TYPE_CHECKING:
+    from gacrl.experiments.compare.replays import Gallery
     from gacrl.report.figures import Look, Series
     from gacrl.report.page import Page
 
@@ -25,21 +32,45 @@ _MARKS = 101
 """Thresholds of a performance profile."""
 
 
-def write_page(comparison: Comparison, folder: Path) -> Path:
-    """Write `comparison.html`, `comparison.md` and their figures; returns the HTML file.
+def file_of(out: Path) -> Path:
+    """Return the HTML file of a report that is to be written there."""
+    return out if out.suffix == ".html" else out / f"{PAGE}.html"
 
-    Raises UserError where the folder cannot be written.
+
+def write_page(comparison: Comparison, out: Path, command: str, galleries: "Sequence[Gallery]" = ()) -> Path:
+    """Write the report: into the one file `out` where it ends in .html, else into the folder `out`.
+
+    command: what was typed. galleries: the episodes of each group (`replays.record`); none: nobody played them. In a
+    folder there are `comparison.html`, `comparison.md` and their figures. Returns the HTML file. Raises UserError where
+    it cannot be written.
     """
     from gacrl.report import figures
     from gacrl.report.page import Page
 
-    page = Page("Comparison of " + ", ".join(group.name for group in comparison.groups))
+    names = [group.name for group in comparison.groups]
+    styles = figures.looks(names, {group.name: group.config.algorithm.name for group in comparison.groups})
+    page = Page(f"{'Report of' if len(names) == 1 else 'Comparison of'} {', '.join(names)}")
+    _numbers(page, comparison)
+    for metric in comparison.metrics:
+        _figures(page, comparison, metric, styles)
+    _exploration(page, comparison, styles)
+    if galleries:
+        _episodes(page, comparison, galleries)
+    _settings(page, comparison)
+    _repeat(page, comparison, command)
+    return page.write_html(out) if file_of(out) == out else page.write(out, PAGE)
+
+
+def _numbers(page: "Page", comparison: Comparison) -> None:
+    """The tables, and what must be known beside them."""
     page.text(about(comparison))
     if comparison.notes:
         page.heading("Read this first")
         for note in comparison.notes:
             page.text(note[:1].upper() + note[1:] + ".")
-    for listing in listings(comparison, None):
+    results, *others = listings(comparison, None)
+    page.table(results.columns, results.rows, "closing evaluation")
+    for listing in others:
         page.table(listing.columns, listing.rows, listing.caption)
     if comparison.pairs:
         page.heading("How to read the differences", 3)
@@ -47,17 +78,70 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
             page.text(f"{name[:1].upper()}{name[1:]}: {meaning}.")
     if summaries := _summaries(comparison):
         page.table(("metric", "group", "mean", "median"), summaries, "other statistics of the same seeds")
-    names = [group.name for group in comparison.groups]
-    styles = figures.looks(names, {group.name: group.config.algorithm.name for group in comparison.groups})
-    for metric in comparison.metrics:
-        _figures(page, comparison, metric, styles)
-    page.heading("Runs")
-    members = [run for group in comparison.groups for run in group.members]
-    runs = " ".join(str(run.path) for run in members)
-    again = any(run.set_horizon not in (None, comparison.horizon) for run in members)
-    horizon = f" --horizon {comparison.horizon}" if again else ""
-    page.code(f"gacrl compare {runs}{horizon}{tasks.flag(comparison.groups[0].config.task)}")
-    return page.write(folder, PAGE)
+    columns, rows = everything(comparison)
+    page.table(columns, rows, "every metric of the task, beside policies that learn nothing")
+
+
+def _exploration(page: "Page", comparison: Comparison, styles: "Mapping[str, Look]") -> None:
+    """How exploration followed progress, in groups whose rule looks at it."""
+    from gacrl.report import figures
+
+    found = {group.name: ways(group, comparison.play) for group in comparison.groups}
+    found = {name: seeds for name, seeds in found.items() if seeds}
+    if not found:
+        return
+    metric = progress_metric(comparison.groups[0].config)
+    page.heading("Exploration against progress")
+    page.figure(
+        figures.paths(found, comparison.axis(metric), "share of random actions (ε)", styles),
+        "Each seed's way along training: the share of random actions in its last update before each evaluation, over "
+        "the progress in that evaluation. A dot marks the end.",
+        "exploration",
+    )
+
+
+def _episodes(page: "Page", comparison: Comparison, galleries: "Sequence[Gallery]") -> None:
+    """The player, and why there is nothing of some groups."""
+    page.heading("Episodes")
+    for gallery in galleries:
+        if gallery.shown:
+            page.text(
+                f"{gallery.name}: the best, the median and the worst {len(gallery.shown) - 2} of {gallery.of:,} "
+                "episodes of the closing evaluation by their return, over all seeds."
+            )
+        else:
+            page.text(f"{gallery.name}: no episodes to play, since {gallery.because}.")
+    if any(gallery.shown for gallery in galleries):
+        from gacrl.experiments.compare.replays import data  # loads jax, as what is shown has
+
+        style, script = bundle.source("report.css"), bundle.script("report.js")
+        page.live(style, script, data(comparison, galleries), "The page as HTML plays these episodes.")
+
+
+def _settings(page: "Page", comparison: Comparison) -> None:
+    page.heading("Settings and versions")
+    for group in comparison.groups:
+        page.details(f"Settings of {group.name}", configuration.dumps(group.config).strip())
+    runs = [run for group in comparison.groups for run in group.members]
+    made = {str(run.path): run.summary.get("versions", {}) for run in runs}
+    packages = list(dict.fromkeys(name for versions in made.values() for name in versions))
+    rows = [(path, *(str(versions.get(name, "")) for name in packages)) for path, versions in made.items()]
+    page.table(("run", *packages), rows, "versions that measured each run")
+
+
+def _repeat(page: "Page", comparison: Comparison, command: str) -> None:
+    """The commands that make the runs and this page again."""
+    page.heading("To repeat it")
+    task = comparison.groups[0].config.task
+    made = [_made(run, task) for group in comparison.groups for run in group.members]
+    page.code("\n".join([*made, command]))
+
+
+def _made(run: Finished, task: str) -> str:
+    """The command that trains a run again, into the next free folder."""
+    begun_from = RunFolder.open(run.path).begun_from()
+    start = "" if begun_from is None else f" --from {shlex.quote(begun_from)}"
+    return f"gacrl train --config {shlex.quote(str(run.path / 'config.json'))}{start}{tasks.flag(task)}"
 
 
 def _figures(page: "Page", comparison: Comparison, metric: str, styles: "Mapping[str, Look]") -> None:

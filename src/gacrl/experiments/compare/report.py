@@ -4,9 +4,14 @@ import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from gacrl.cli.tables import print_table
+from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import Equivalence, with_interval
 from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair
+from gacrl.experiments.compare.finished import closing_value
 from gacrl.experiments.compare.groups import Group
 from gacrl.report.screen import console
 
@@ -111,6 +116,30 @@ def _results(comparison: Comparison) -> _Listing:
     return _Listing(about(comparison), ("group", "seeds", *labels), rows)
 
 
+def everything(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the columns and rows of a table with every metric that the task has in its tables."""
+    ended = [group for group in comparison.groups if group.seeds]
+    metrics = [name for name in comparison.facts["shown"] if all(_has(group, comparison, name) for group in ended)]
+    rows = [(group.name, *(_shown(_closing(group, comparison, name)) for name in metrics)) for group in ended]
+    rows += [
+        (who, *(f"{values[name]:.3f}" if name in values else "" for name in metrics))
+        for who, values in comparison.references.items()
+    ]
+    return ("group", *map(comparison.label, metrics)), rows
+
+
+def _has(group: Group, comparison: Comparison, metric: str) -> bool:
+    return all(metric in run.summary["final"][comparison.play] for run in group.members if run.diverged is None)
+
+
+def _closing(group: Group, comparison: Comparison, metric: str) -> Float[np.ndarray, " S"]:
+    """The closing values of its seeds."""
+    ended = [run for run in group.members if run.diverged is None]
+    return np.array(
+        [closing_value(run, comparison.play, metric, k) for run in ended for k in range(run.config.num_seeds)]
+    )
+
+
 def _seeds(group: Group) -> str:
     """How many there are, and how many of them have no closing evaluation."""
     many = len(group.seeds) + len(group.lost)
@@ -118,10 +147,14 @@ def _seeds(group: Group) -> str:
 
 
 def _estimate(group: Group, metric: str) -> str:
-    found, point = group.estimate(metric), group.point(metric)
-    if point is None:
-        return "diverged"
-    return f"{point:.3f} (one seed: no interval)" if found is None else with_interval(found)
+    return _shown(group.final[metric]) if group.seeds else "diverged"
+
+
+def _shown(values: Float[np.ndarray, " S"]) -> str:
+    """The interquartile mean over seeds with its interval."""
+    if len(values) == 1:
+        return f"{values[0]:.3f} (one seed: no interval)"
+    return with_interval(statistics.estimate(values))
 
 
 def _margins(pairs: Sequence[Pair]) -> list[float]:
