@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gacrl.report.safe import digest, embedded
+from gacrl.report.theme import theme
 
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./([\w-]+\.js)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:class|const|function|let) )", re.MULTILINE)
@@ -21,11 +22,6 @@ _NAME = re.compile(r"^(?:class|const|let|(?:async )?function\*?) (\w+)", re.MULT
 def source(name: str) -> str:
     """Read a file of the page."""
     return (resources.files("gacrl.export") / "page" / name).read_text(encoding="utf-8")
-
-
-def theme() -> str:
-    """Return the colours of the page, light and dark, as its style sheet begins: reports have the same."""
-    return source("page.css").partition("* {")[0]
 
 
 def script(main: str, texts: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -58,7 +54,7 @@ def _place(module: str, texts: Mapping[str, str], placed: dict[str, str], above:
 
 def page(title: str, data: Mapping[str, Any]) -> str:
     """Return the page. Its policy lets it run its own script and style, and load nothing; texts are escaped."""
-    code, style = script("main.js"), source("page.css")
+    code, style = script("main.js"), theme() + source("page.css")
     allowed = (
         "default-src 'none'",
         f"script-src '{digest(code)}'",

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gacrl.errors import UserError, reason
-from gacrl.export.bundle import theme
 from gacrl.report.safe import digest, embedded
+from gacrl.report.theme import theme
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 """Nothing is loaded. SVG has its style in its elements."""
