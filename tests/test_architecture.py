@@ -23,7 +23,16 @@ SETTINGS_OF_TASKS = tuple(f"{task}.settings" for task in TASKS)
 
 LAYERS = (
     ("errors", "extras", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
-    ("cli.arguments", "cli.tables", "envs", "messages.interventions", "networks", "report", "scene", "export.bundle"),
+    (
+        "cli.arguments",
+        "cli.tables",
+        "envs",
+        "messages.interventions",
+        "networks",
+        "report",
+        "scene",
+        "export.bundle",
+    ),
     ("tasks.own", "tasks.foreign", *TASKS),
     ("algorithms",),
     ("rollout", "hosting"),
