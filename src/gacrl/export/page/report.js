@@ -12,7 +12,7 @@ const REACH = 1.6;  // an agent is caught within so many of its radii
 const page = JSON.parse(byId("live-data").textContent);
 const still = { group: 0, episode: 0, t: 0, playing: false, speed: 5, agent: 0, frames: [], area: null };
 
-const canvas = make("canvas", { tabindex: 0, role: "img", "aria-describedby": "live-keys" });
+const canvas = make("canvas", { id: "live-canvas", tabindex: 0, role: "img", "aria-describedby": "live-keys" });
 const groups = make("select", { onchange: () => act.open(Number(groups.value), 0) }, ...page.groups.map((group, k) => make("option", { value: k }, group.name)));
 const episodes = make("select", { onchange: () => act.open(still.group, Number(episodes.value)) });
 const play = make("button", { type: "button", class: "main", onclick: () => act.toggle() }, "Play");
