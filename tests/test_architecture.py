@@ -37,7 +37,7 @@ LAYERS = (
     ("algorithms",),
     ("rollout", "hosting"),
     ("evaluation",),
-    ("adapters", "messages", "render"),
+    ("adapters", "messages", "pen", "reel", "render"),
     ("film", "export.replays"),
     ("training",),
     ("experiments", "play", "api"),

@@ -400,7 +400,7 @@ def _render(words: Words) -> int:
     title, beside, also = f"{told}: {asked.run}" if told else asked.run, None, ""
     if asked.beside:
         from gacrl.messages.interventions import silence
-        from gacrl.render import Beside
+        from gacrl.reel import Beside
 
         with _called("--beside", "the intervention"):
             other, also = record(silence() if happens is None else happens)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gacrl.evaluation.episodes import Episode
-from gacrl.render import COVERED, SYMBOL_COLOURS, UNCOVERED
+from gacrl.pen import COVERED, SYMBOL_COLOURS, UNCOVERED
 from gacrl.scene import Discs
 
 COLOURS = {"symbols": SYMBOL_COLOURS, "lit": COVERED, "unlit": UNCOVERED}
