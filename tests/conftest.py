@@ -12,6 +12,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")  # com
 
 os.environ.pop("COLUMNS", None)  # what is printed is as wide as in a log, wherever the tests run
 
+import browsing
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -91,6 +92,17 @@ def from_outside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for registry, kept in zip(registries, before, strict=True):
         registry.clear()
         registry.update(kept)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A headless Chromium. Where there is none, its tests are skipped with a line that says so; `.ci/run` has one."""
+    missing = browsing.missing()
+    if missing and "GACRL_BROWSER" in os.environ:
+        pytest.fail(missing)
+    if missing:
+        pytest.skip(missing)
+    yield from browsing.opened()
 
 
 def soaked(cases: Iterable[Any], *kept: Any) -> list[Any]:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from test_render import world
 
-from gacrl import film, render
+from gacrl import film, reel, render
 from gacrl.errors import UserError
 
 FFMPEG = """import json, sys
@@ -56,7 +56,7 @@ def test_an_mp4_has_every_frame_as_long_as_it_is_seen(ffmpeg, tmp_path: Path):
     assert f'"{first.width}x{first.height}"'.encode() in words
     frames = np.frombuffer(data, np.uint8).reshape(-1, first.height, first.width, 3)
     assert len(frames) == sum((6 + steps - 1 + 15) for steps in (3, 2)), "0.6 s first, 1.5 s last, at ten a second"
-    drawn = [np.asarray(picture) for picture in render.drawn(episodes, 120)]
+    drawn = [np.asarray(picture) for picture in reel.drawn(episodes, 120)]
     shown = np.repeat(np.arange(7), [6, 1, 1, 15, 6, 1, 15])
     for frame, number in zip(frames, shown, strict=True):
         np.testing.assert_array_equal(frame, drawn[number])
@@ -87,7 +87,7 @@ def test_a_gif_needs_nobody(nobodys, tmp_path: Path):
 def test_a_strip_shows_moments_in_rows_and_what_is_beside_below(tmp_path: Path):
     played = [world([[0, 0]], [[0.2, 0]], steps=4), world([[0, 0]], [[0.2, 0]], steps=2)]
     others = [world([[0.5, 0]], [[0.2, 0]], steps=2), world([[3, 0]], [[0.2, 0]], steps=2)]
-    beside = render.Beside(others, "silent")
+    beside = reel.Beside(others, "silent")
     out = tmp_path / "strip.png"
     film.write(played, out, size=120, title="as it is", beside=beside)
     first = render.frame(played[0], 0, 120)
@@ -95,11 +95,11 @@ def test_a_strip_shows_moments_in_rows_and_what_is_beside_below(tmp_path: Path):
         assert strip.size == (5 * first.width, 4 * first.height), "five moments of the longer one, four rows"
         picture = np.asarray(strip.convert("RGB"))
     assert (picture[2 * first.height :, 3 * first.width :] == 255).all(), "the other has three"
-    films = list(render.drawn(played, 120, "as it is", beside=beside))
-    assert len(films) == len(render.durations(played, 10, beside)) == 5 + 3
+    films = list(reel.drawn(played, 120, "as it is", beside=beside))
+    assert len(films) == len(reel.durations(played, 10, beside)) == 5 + 3
     wide = np.asarray(films[4])
     assert wide.shape[1] == 2 * first.width
     np.testing.assert_array_equal(wide[:, : first.width], picture[: first.height, -first.width :])
     np.testing.assert_array_equal(wide[:, first.width :], picture[first.height : 2 * first.height, -first.width :])
     with pytest.raises(UserError, match=r"a strip shows at most 6 episodes so, not 7; say --episodes 6"):
-        film.write(played * 3 + played[:1], out, beside=render.Beside(others * 3 + others[:1], ""))
+        film.write(played * 3 + played[:1], out, beside=reel.Beside(others * 3 + others[:1], ""))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from gacrl import render
+from gacrl import pen, reel, render
 from gacrl.evaluation.episodes import Episode
 from gacrl.scene import PLAIN, Discs, Scene
 from gacrl.tasks.task import Words
@@ -115,7 +115,7 @@ def walk(seed: int, agents: int = 3, steps: int = 25) -> Episode:
 def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_path):
     episodes = [world([[0, 0]], [[0.5, 0.5]], steps=3, symbols=[1]), walk(0, steps=5)]
     path = tmp_path / "two.gif"
-    render.gif(episodes, path, size=240, fps=20, title="Two", words=SPREAD)
+    reel.gif(episodes, path, size=240, fps=20, title="Two", words=SPREAD)
     assert [file.name for file in tmp_path.iterdir()] == ["two.gif"]
     with Image.open(path) as film:
         assert film.n_frames == 4 + 6
@@ -136,8 +136,8 @@ def test_the_gif_has_every_frame_for_its_time_and_shows_what_frame_shows(tmp_pat
 
 def test_a_long_episode_is_thinned_and_no_more_than_a_frame_is_kept(tmp_path, monkeypatch):
     """41 moments in 9 frames, five apart; and 3 in 3. Each is on the disk before the next is drawn."""
-    monkeypatch.setattr(render, "MOST_FRAMES", 9)
-    kept, written, add = [], [], render._Film.add
+    monkeypatch.setattr(reel, "MOST_FRAMES", 9)
+    kept, written, add = [], [], reel._Film.add
 
     def watched(film, frame, pause) -> None:
         kept.append(weakref.ref(frame))
@@ -145,11 +145,11 @@ def test_a_long_episode_is_thinned_and_no_more_than_a_frame_is_kept(tmp_path, mo
         assert sum(frame() is not None for frame in kept) <= 2, "this one and the one before"
         written.append(film._file.tell())
 
-    monkeypatch.setattr(render._Film, "add", watched)
+    monkeypatch.setattr(reel._Film, "add", watched)
     long, path = walk(0, steps=40), tmp_path / "long.gif"
-    render.gif([long, walk(1, steps=2)], path, size=240, fps=20, title="Long", words=SPREAD)
+    reel.gif([long, walk(1, steps=2)], path, size=240, fps=20, title="Long", words=SPREAD)
     assert len(written) == 12 and (np.diff(written) > 0).all()
-    assert (render.num_frames(40), render.num_frames(2)) == (9, 3)
+    assert (reel.num_frames(40), reel.num_frames(2)) == (9, 3)
     with Image.open(path) as film:
         assert film.n_frames == 12
         durations = []
@@ -166,7 +166,7 @@ def test_a_long_episode_is_thinned_and_no_more_than_a_frame_is_kept(tmp_path, mo
 def test_a_frame_in_which_nothing_changes_has_its_time(tmp_path):
     path, still = tmp_path / "still.gif", np.zeros((4, 5), np.uint8)
     with path.open("wb") as file:
-        film = render._Film(file, [10, 20, 30, 200, 100, 50])
+        film = reel._Film(file, [10, 20, 30, 200, 100, 50])
         for pause in (600, 50, 1500):
             film.add(still, pause)
         film.end()
@@ -180,7 +180,7 @@ def test_a_frame_in_which_nothing_changes_has_its_time(tmp_path):
 
 def test_four_usual_episodes_make_a_small_file(tmp_path):
     path = tmp_path / "four.gif"
-    render.gif([walk(seed) for seed in range(4)], path, words=SPREAD)
+    reel.gif([walk(seed) for seed in range(4)], path, words=SPREAD)
     assert 100_000 < path.stat().st_size < 800_000
 
 
@@ -188,7 +188,7 @@ def test_a_covered_landmark_has_the_covered_colour_and_only_that_one():
     picture = render.frame(world([[-0.65, 0.3], [0, -0.8]], [[-0.6, 0.3], [0.6, -0.3]]), 0)
     values = scene(picture)
     scale = 480 * 0.92 / 2  # the view is the start square and a margin
-    covered, dashes = where(values, render.COVERED), where(values, render.UNCOVERED)
+    covered, dashes = where(values, pen.COVERED), where(values, pen.UNCOVERED)
     np.testing.assert_allclose(covered.mean(0), 240 - np.array([0.3, 0.6]) * scale, atol=3)
     np.testing.assert_allclose(np.ptp(covered, axis=0), 0.2 * scale, atol=3)
     dashes = dashes[(dashes[:, 1] > 300) & (dashes[:, 0] < 400)]  # apart from what is written
@@ -200,15 +200,15 @@ def test_each_agent_shows_its_symbol_in_a_colour_of_its_own():
     columns = np.linspace(-0.85, 0.85, 4)
     places = [(x, y) for y in (0.5, -0.5) for x in columns]
     values = scene(render.frame(world(places, [[0, 0]], symbols=range(8)), 0))
-    for (x, y), colour in zip(places, render.SYMBOL_COLOURS, strict=True):
+    for (x, y), colour in zip(places, pen.SYMBOL_COLOURS, strict=True):
         row, column = where(values, colour, 4).mean(0)
         assert abs(column - 240 - 220 * (x + 0.15)) < 12
         assert abs(row - (240 - 220 * (y + 0.15))) < 12
     # After the last step the last words stay; the ninth symbol has the first one's colour, not its letter.
     quiet = world([[0, 0]], [[0.5, 0.5]], messages=np.zeros((3, 1, 1, 8)))
     first, ninth = (scene(render.frame(world([[0, 0]], [[0.5, 0.5]], symbols=[s]), 3)) for s in (0, 8))
-    assert len(where(first, render.SYMBOL_COLOURS[0])) > 100
-    assert len(where(scene(render.frame(quiet, 3)), render.SYMBOL_COLOURS[0])) == 0
+    assert len(where(first, pen.SYMBOL_COLOURS[0])) > 100
+    assert len(where(scene(render.frame(quiet, 3)), pen.SYMBOL_COLOURS[0])) == 0
     assert 5 < (first != ninth).any(-1).sum() < 200
 
 
@@ -222,7 +222,7 @@ def test_each_round_has_a_bubble_of_its_own_from_left_to_right():
         return np.asarray(render.frame(world([[0, 0]], [[0.9, 0.9]], messages=messages), 1)).astype(int)
 
     def columns(values: np.ndarray, symbol: int) -> np.ndarray:
-        return where(values[38:518], render.SYMBOL_COLOURS[symbol], 4)[:, 1]
+        return where(values[38:518], pen.SYMBOL_COLOURS[symbol], 4)[:, 1]
 
     both, first = picture(said(1, 2)), picture(said(1))
     np.testing.assert_allclose(columns(both, 1).mean(), columns(first, 1).mean(), atol=3)
@@ -250,7 +250,7 @@ def test_colours_can_be_told_apart(vision):
         x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
         return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
-    colours = [*render.SYMBOL_COLOURS, render.COVERED]
+    colours = [*pen.SYMBOL_COLOURS, pen.COVERED]
     assert min(np.linalg.norm(lab(a) - lab(b)) for a, b in itertools.combinations(colours, 2)) > 20
 
 
@@ -327,9 +327,9 @@ def test_who_has_left_is_not_drawn_and_says_nothing():
     staying = world(places, [[0, 0.9]], 3, [1, 2])
     for t in range(3):
         np.testing.assert_array_equal(scene(render.frame(leaving, t)), scene(render.frame(staying, t)))
-    assert len(where(scene(render.frame(leaving, 3)), render.SYMBOL_COLOURS[1])) > 100
-    assert len(where(scene(render.frame(leaving, 3)), render.SYMBOL_COLOURS[2])) == 0
-    assert len(where(scene(render.frame(staying, 3)), render.SYMBOL_COLOURS[2])) > 100
+    assert len(where(scene(render.frame(leaving, 3)), pen.SYMBOL_COLOURS[1])) > 100
+    assert len(where(scene(render.frame(leaving, 3)), pen.SYMBOL_COLOURS[2])) == 0
+    assert len(where(scene(render.frame(staying, 3)), pen.SYMBOL_COLOURS[2])) > 100
     alone = world(places[:1], [[0, 0.9]], 3, [1])
     np.testing.assert_array_equal(scene(render.frame(leaving, 3)), scene(render.frame(alone, 3)))
 
@@ -392,7 +392,7 @@ def test_without_marks_nothing_is_said_of_them():
 def test_colours_of_agents_and_marks_are_those_of_the_symbols():
     """A rim, or a cross in a ring; the ninth begins again, and what has no colour has none of them."""
     plain = world([[-0.5, 0.0]], [[0.5, 0.0]])
-    colour = render.SYMBOL_COLOURS[2]
+    colour = pen.SYMBOL_COLOURS[2]
     assert len(where(scene(render.frame(plain, 1)), colour)) == 0
     agent = redrawn(plain, agents={"colour": np.full((4, 1), 2)})
     found = where(scene(render.frame(agent, 1)), colour)
@@ -407,7 +407,7 @@ def test_colours_of_agents_and_marks_are_those_of_the_symbols():
     # A lit mark of a colour shows both.
     lit = redrawn(mark, marks={"lit": np.ones((4, 1), bool)})
     values = scene(render.frame(lit, 1))
-    assert len(where(values, colour, 40)) > 40 and len(where(values, render.COVERED)) > 40
+    assert len(where(values, colour, 40)) > 40 and len(where(values, pen.COVERED)) > 40
 
 
 def test_an_agent_that_is_lit_has_a_rim_of_alarm():
@@ -451,22 +451,22 @@ def test_without_a_ground_the_picture_is_of_what_there_is():
 def test_what_cannot_be_drawn_or_written(tmp_path):
     episode = world([[0, 0]], [[0.5, 0.5]])
     with pytest.raises(OSError):
-        render.gif([episode], tmp_path / "no folder" / "film.gif")
+        reel.gif([episode], tmp_path / "no folder" / "film.gif")
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(OSError):
-        render.gif([episode], tmp_path / "folder.gif", size=120)
+        reel.gif([episode], tmp_path / "folder.gif", size=120)
     assert [file.name for file in tmp_path.iterdir()] == ["folder.gif"]
     for wrong in ({"size": 10}, {"fps": 0}, {"fps": 1000}):
         with pytest.raises(ValueError, match="must be"):
-            render.gif([episode], tmp_path / "film.gif", **wrong)
+            reel.gif([episode], tmp_path / "film.gif", **wrong)
     with pytest.raises(ValueError, match="at least one episode"):
-        render.gif([], tmp_path / "film.gif")
+        reel.gif([], tmp_path / "film.gif")
     with pytest.raises(ValueError, match="the frames 0 to 3, not 4"):
         render.frame(episode, 4)
     unseen = replace(episode, scene=None)
     with pytest.raises(ValueError, match="the episode has no scene: there is nothing to draw"):
         render.frame(unseen, 0)
     with pytest.raises(ValueError, match="the episode has no scene"):
-        render.gif([episode, unseen], tmp_path / "film.gif")
+        reel.gif([episode, unseen], tmp_path / "film.gif")
     assert [file.name for file in tmp_path.iterdir()] == ["folder.gif"]
     assert render.frame(episode, 0, 120, "long\n" * 99).size[0] == 120

@@ -9,10 +9,11 @@ from importlib import import_module
 from itertools import chain
 from pathlib import Path
 
-from gacrl import render
+from gacrl import reel
 from gacrl.errors import UserError
 from gacrl.evaluation.episodes import Episode, written_whole
-from gacrl.render import WORDS, Beside
+from gacrl.reel import Beside
+from gacrl.render import WORDS
 from gacrl.tasks.task import Words
 
 _FPS = 10
@@ -38,7 +39,7 @@ def write(
     words: Words = WORDS,
     beside: Beside | None = None,
 ) -> None:
-    """Write the episodes, one after the other, in the format that the path ends in; see `render.gif`, `render.strip`.
+    """Write the episodes, one after the other, in the format that the path ends in; see `reel.gif`, `reel.strip`.
 
     Raises UserError where that cannot be, OSError where the file cannot be written.
     """
@@ -46,16 +47,16 @@ def write(
     kind = path.suffix.lower()
     if kind == ".png":
         require_rows(path, len(episodes), beside is not None)
-        render.strip(episodes, path, size, title, words, beside)
+        reel.strip(episodes, path, size, title, words, beside)
     elif kind == ".gif":
-        render.gif(episodes, path, size, _FPS, title, words, beside)
+        reel.gif(episodes, path, size, _FPS, title, words, beside)
     else:
         _mp4(episodes, path, size, title, words, beside)
 
 
 def require_rows(path: Path, episodes: int, beside: bool) -> None:
     """Raise UserError for a strip of too many episodes; films have as many as they like."""
-    most = render.MOST_ROWS // (1 + beside)
+    most = reel.MOST_ROWS // (1 + beside)
     if path.suffix.lower() == ".png" and episodes > most:
         raise UserError(f"{path}: a strip shows at most {most} episodes so, not {episodes}; say --episodes {most}")
 
@@ -64,8 +65,8 @@ def _mp4(
     episodes: Sequence[Episode], path: Path, size: int, title: str, words: Words, beside: Beside | None
 ) -> None:
     """Pipe the frames to ffmpeg; one that is seen for longer is sent several times."""
-    times = [max(1, round(pause * _FPS / 1000)) for pause in render.durations(episodes, _FPS, beside)]
-    frames = render.drawn(episodes, size, title, words, 1, beside)
+    times = [max(1, round(pause * _FPS / 1000)) for pause in reel.durations(episodes, _FPS, beside)]
+    frames = reel.drawn(episodes, size, title, words, 1, beside)
     first = next(frames)
     with written_whole(path) as file, tempfile.TemporaryFile() as said:
         command = [

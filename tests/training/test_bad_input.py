@@ -66,7 +66,7 @@ def traced_once() -> Iterator[None]:
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
         patch.setattr(session.episodes, "cut", lambda *_: [])
-        patch.setattr(session.render, "gif", lambda *_, **__: None)
+        patch.setattr(session.reel, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])
         patch.setattr(paper_tables, "table_3", lambda *_: [])
         yield

@@ -51,7 +51,7 @@ def traced_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(session, "make_trainer", build)
         patch.setattr(session.episodes, "cut", lambda *_: [])
-        patch.setattr(session.render, "gif", lambda *_, **__: None)
+        patch.setattr(session.reel, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])
         patch.setattr(paper_tables, "table_3", lambda *_: [])
         yield

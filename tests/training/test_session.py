@@ -141,7 +141,7 @@ def test_the_seconds_of_a_run_count_the_closing_evaluation_and_the_pictures(
         assert not (tmp_path / "run" / "summary.json").exists()
         time.sleep(0.5)
 
-    monkeypatch.setattr(session.render, "gif", gif)
+    monkeypatch.setattr(session.reel, "gif", gif)
     watcher = Watcher(progress=lambda progress: seconds.append(progress.clock.wall))
     run = session.start(config, tmp_path / "run", watcher)
     assert run.summary is not None

@@ -268,6 +268,7 @@ class Compare:
       gacrl compare runs/mappo-1 runs/paper-1 --horizon 25 --label MAPPO "the paper's"
       gacrl compare runs/gacrl-1 runs/gacrl-2 runs/vdn-1 --metric coverage_final_0.1 --out runs/comparison
       gacrl compare runs/gacrl-1 runs/vdn-1 --metric coverage_final_0.1 --margin 0.02
+      gacrl compare runs/gacrl-1 --out report.html      everything about one run, on a page with its episodes
     """
 
     run: tyro.conf.Positional[tuple[Path, ...]]
@@ -284,7 +285,9 @@ class Compare:
     sampled: bool = False
     """Compare the policies as they explore, instead of greedily."""
     out: Path | None = None
-    """A folder for the comparison as a page (HTML and Markdown) with figures."""
+    """Where to write the report: one HTML file where it ends in .html, else a folder for it, Markdown and figures."""
+    replays: bool = True
+    """Play the closing evaluation again, so that the report shows the best, the median and the 20 worst episodes."""
     csv: Path | None = None
     """A file for every seed's value of every metric, a row each."""
     marl_eval: Path | None = None

@@ -1,12 +1,12 @@
 """The command that takes a run elsewhere."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from gacrl import export as formats
 from gacrl import tasks
+from gacrl.cli.output import warn
 from gacrl.cli.words import Words
 from gacrl.errors import UserError
 
@@ -32,7 +32,7 @@ def export(words: Words) -> int:
     def change(settings: Any) -> Any:
         return parsing.changed(settings, rest, "export", arguments.Export)
 
-    source = Source(asked.run, change, lambda sentence: print(f"gacrl: {sentence}", file=sys.stderr))
+    source = Source(asked.run, change, warn)
     change(source.folder.config().env)  # refuses odd flags for every format
     prepare_jax()
     written = write(source, asked.out.absolute())

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
 from gacrl.cli import output, stopwatch, studies
+from gacrl.cli.compare import compare
 from gacrl.cli.export import export
+from gacrl.cli.output import warn
 from gacrl.cli.stopping import stopping
 from gacrl.cli.words import Words
 from gacrl.config import files as configuration
@@ -352,7 +354,7 @@ def _evaluate(words: Words) -> int:
         episodes=asked.episodes,
         change=_changes(asked, rest, "evaluate"),
         backend=asked.backend,
-        warn=_warn,
+        warn=warn,
         task=words.task or tasks.DEFAULT,
         intervention=_intervention(asked.messages),
     )
@@ -387,7 +389,7 @@ def _render(words: Words) -> int:
     happens = _intervention(asked.messages)
 
     def record(intervention: "Intervention | None") -> tuple["Recorded", str]:
-        shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, _warn, task, intervention)
+        shown = scoring.record_run(asked.run, asked.episodes, change, asked.sampled, warn, task, intervention)
         return shown, "" if shown.intervention is None else shown.intervention.told
 
     shown, told = record(None if asked.beside else happens)
@@ -398,7 +400,7 @@ def _render(words: Words) -> int:
     title, beside, also = f"{told}: {asked.run}" if told else asked.run, None, ""
     if asked.beside:
         from gacrl.messages.interventions import silence
-        from gacrl.render import Beside
+        from gacrl.reel import Beside
 
         with _called("--beside", "the intervention"):
             other, also = record(silence() if happens is None else happens)
@@ -406,43 +408,6 @@ def _render(words: Words) -> int:
     film.write(shown.episodes, out, asked.size, title, shown.task.words, beside)
     notes = "".join(f"; {note}" for note in (told, f"beside them {also}" if also else "") if note)
     print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}{notes}")
-    return 0
-
-
-def _compare(words: list[str]) -> int:
-    from gacrl.cli import arguments, parsing
-
-    asked = parsing.parse(arguments.Compare, words, "compare")
-    from gacrl.experiments.compare import compare
-    from gacrl.experiments.compare import data as compare_data
-    from gacrl.experiments.compare import report as compare_report
-
-    files = ([asked.out / f"{compare_report.PAGE}.html"] if asked.out else []) + [asked.marl_eval, asked.csv]
-    for path in files:
-        if path is not None and path.exists() and not asked.overwrite:
-            raise UserError(f"{path} exists: choose another place, or say --overwrite")
-    play = "sampled" if asked.sampled else "greedy"
-    if asked.horizon is not None:
-        from gacrl.training.devices import prepare_jax
-
-        prepare_jax()
-    labels = [name for names in asked.label for name in names]
-    comparison = compare.compare(asked.run, asked.metric, play, _warn, asked.margin, labels, asked.horizon)
-    # Files first: whoever reads the tables may stop, or not understand the characters.
-    written: list[str] = []
-    if asked.out is not None:
-        written.append(f"page       {compare_report.write_page(comparison, asked.out)}")
-    if asked.marl_eval is not None:
-        asked.marl_eval.write_text(json.dumps(compare_data.to_marl_eval(comparison)) + "\n", encoding="utf-8")
-        written.append(f"marl-eval  {asked.marl_eval}")
-    if asked.csv is not None:
-        compare_data.write_csv(comparison, asked.csv)
-        written.append(f"csv        {asked.csv}")
-    compare_report.print_comparison(comparison)
-    for line in written:
-        print(line)
-    if asked.json:
-        print(json.dumps(compare_data.to_dict(comparison)))
     return 0
 
 
@@ -501,17 +466,13 @@ def _doctor(words: list[str]) -> int:
     return 0
 
 
-def _warn(sentence: str) -> None:
-    print(f"gacrl: {sentence}", file=sys.stderr)
-
-
 _COMMANDS: dict[str, Callable[[Any], int]] = {
     "train": _train,
     "resume": _resume,
     "evaluate": _evaluate,
     "render": _render,
     "export": export,
-    "compare": _compare,
+    "compare": compare,
     "reproduce": studies.reproduce,
     "ablate": studies.ablate,
     "talk": studies.talk,

@@ -7,6 +7,11 @@ from typing import Any
 from gacrl.report.letters import PLAIN_LETTERS
 
 
+def warn(sentence: str) -> None:
+    """Say a sentence where errors are told."""
+    print(f"gacrl: {sentence}", file=sys.stderr)
+
+
 def prepare() -> None:
     """Let standard output and error take every letter, and outlive whoever reads them.
 

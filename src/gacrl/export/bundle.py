@@ -4,15 +4,15 @@ The modules are plain ES modules in `page/`. A page is opened from disk, where m
 stand one after the other in a single script: imports and the word `export` are taken out, and nothing else.
 """
 
-import base64
-import hashlib
 import html
-import json
 import re
 from collections.abc import Mapping
 from importlib import resources
 from types import MappingProxyType
 from typing import Any
+
+from gacrl.report.safe import digest, embedded
+from gacrl.report.theme import theme
 
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./([\w-]+\.js)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:class|const|function|let) )", re.MULTILINE)
@@ -54,26 +54,19 @@ def _place(module: str, texts: Mapping[str, str], placed: dict[str, str], above:
 
 def page(title: str, data: Mapping[str, Any]) -> str:
     """Return the page. Its policy lets it run its own script and style, and load nothing; texts are escaped."""
-    code, style = script("main.js"), source("page.css")
+    code, style = script("main.js"), theme() + source("page.css")
     allowed = (
         "default-src 'none'",
-        f"script-src '{_digest(code)}'",
-        f"style-src '{_digest(style)}'",
+        f"script-src '{digest(code)}'",
+        f"style-src '{digest(style)}'",
         "base-uri 'none'",
         "form-action 'none'",
     )
-    plain = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    for mark in "<>&\u2028\u2029":  # no text can end the element that it stands in
-        plain = plain.replace(mark, f"\\u{ord(mark):04x}")
     parts = {
         "policy": html.escape("; ".join(allowed), quote=True),
         "title": html.escape(title),
         "style": style,
-        "data": plain,
+        "data": embedded(data),
         "script": code,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))
-
-
-def _digest(text: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -19,7 +19,6 @@ from gacrl.export.yardsticks import yardsticks
 from gacrl.messages import interventions
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
-from gacrl.render import COVERED, SYMBOL_COLOURS, UNCOVERED
 from gacrl.types import Intervention
 
 MOST_BYTES = 400_000
@@ -57,7 +56,7 @@ def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
         "summary": task.summary,
         "actions": list(task.actions(opened.config.env)),
         "words": {"agent": words.agent, "mark": words.mark, "lit": words.lit},
-        "colours": {"symbols": SYMBOL_COLOURS, "lit": COVERED, "unlit": UNCOVERED},
+        "colours": replays.COLOURS,
         "measures": {},
         "yardsticks": {},
         "dictionary": [],

@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 
 from gacrl.evaluation.episodes import Episode
+from gacrl.pen import COVERED, SYMBOL_COLOURS, UNCOVERED
 from gacrl.scene import Discs
 
+COLOURS = {"symbols": SYMBOL_COLOURS, "lit": COVERED, "unlit": UNCOVERED}
+"""In which a page draws them."""
 STEPS = 1000
 """Steps of an episode that are kept at the most."""
 

@@ -271,6 +271,32 @@ def profile(
     return out.getvalue()
 
 
+def paths(
+    walks: Mapping[str, Sequence[tuple[Numbers, Numbers]]],
+    xlabel: str,
+    ylabel: str,
+    styles: Mapping[str, Look] | None = None,
+) -> str:
+    """For each name the way of each seed through a plane, x [P] and y [P], to a marker where it ends; SVG.
+
+    styles: from `looks`.
+    """
+    styles = styles or looks(list(walks))
+    with _figure(_WIDTH, max(3.6, 0.9 + 0.19 * len(walks))) as (figure, out):
+        axes = figure.add_subplot()
+        labels: list[Label] = []
+        for name, seeds in walks.items():
+            color, dash, shape = styles[name]
+            for x, y in seeds:
+                axes.plot(x, y, linestyle=dash, color=color, linewidth=0.8, alpha=0.5)
+                axes.plot(np.asarray(x)[-1:], np.asarray(y)[-1:], shape, color=color, markersize=5)
+            height = float(np.mean([np.asarray(y, float)[-1] for _, y in seeds]))
+            labels.append(Label(name, height, _style(styles[name]), False))
+        _say(axes, xlabel, ylabel)
+        beside(axes, labels)
+    return out.getvalue()
+
+
 def heat(
     values: Numbers,
     panels: tuple[str, Sequence[str]],

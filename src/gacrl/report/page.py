@@ -8,23 +8,37 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gacrl.errors import UserError, reason
+from gacrl.report.safe import digest, embedded
+from gacrl.report.theme import theme
 
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+"""Nothing is loaded. SVG has its style in its elements."""
 _STYLE = """\
-body { max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1a1a1a; background: #fff;
-  font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1, h2, h3, h4 { line-height: 1.25; margin: 2rem 0 .6rem; }
+body { max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: var(--ink); background: Canvas; }
+@media (prefers-color-scheme: dark) {
+  body { background: #0e1216; }
+  figure.plot svg { filter: invert(.93) hue-rotate(180deg); }
+}
+h1, h2, h3, h4 { line-height: 1.25; margin: 2rem 0 .6rem; overflow-wrap: anywhere; }
 h1 { margin-top: 0; }
+p { overflow-wrap: anywhere; }
 .wide { overflow-x: auto; margin: 1.2rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
-caption { caption-side: top; text-align: left; font-weight: 600; padding-bottom: .3rem; }
-th, td { padding: .3rem .8rem .3rem 0; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top; }
-th { border-bottom: 2px solid #888; }
-figure { margin: 1.6rem 0; }
-figure svg { max-width: 100%; height: auto; }
-figcaption { color: #444; font-size: .92rem; }
-pre { background: #f4f4f4; padding: .7rem 1rem; overflow-x: auto; }"""
+.wide > table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
+.wide caption { caption-side: top; text-align: left; font-weight: 600; padding-bottom: .3rem; }
+.wide th, .wide td { padding: .3rem .8rem .3rem 0; text-align: left; vertical-align: top;
+  border-bottom: 1px solid var(--border); }
+.wide th { border-bottom: 2px solid var(--faint); }
+figure.plot { margin: 1.6rem 0; overflow-x: auto; }
+figure.plot svg { max-width: 100%; height: auto; }
+@media (max-width: 40rem) { figure.plot svg { max-width: none; } }
+figcaption { color: var(--faint); font-size: .92rem; }
+pre { background: var(--panel); padding: .7rem 1rem; overflow-x: auto; }
+details { margin: .8rem 0; }
+summary { cursor: pointer; font-weight: 600; }
+:focus-visible { outline: 3px solid var(--accent); outline-offset: 2px; }"""
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,35 @@ class _Code:
 
 
 @dataclass(frozen=True)
+class _Details:
+    summary: str
+    text: str
+
+    def as_html(self) -> str:
+        return f"<details><summary>{html.escape(self.summary)}</summary>{_Code(self.text).as_html()}</details>"
+
+    def as_markdown(self, figures: str) -> str:
+        return f"{_paragraph(self.summary)}\n\n{_Code(self.text).as_markdown(figures)}"
+
+
+@dataclass(frozen=True)
+class _Live:
+    style: str
+    script: str
+    data: str
+    said: str
+
+    def as_html(self) -> str:
+        return (
+            f'<section id="live"></section>\n<script type="application/json" id="live-data">{self.data}</script>\n'
+            f'<script type="module">{self.script}</script>'
+        )
+
+    def as_markdown(self, figures: str) -> str:
+        return _paragraph(self.said)
+
+
+@dataclass(frozen=True)
 class _Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -98,7 +141,7 @@ class _Figure:
         inline = re.sub(
             r"<svg\b", f'<svg role="img" aria-label="{html.escape(self.caption)}"', self.inline(), count=1
         )
-        return f"<figure>\n{inline}\n<figcaption>{html.escape(self.caption)}</figcaption>\n</figure>"
+        return f'<figure class="plot">\n{inline}\n<figcaption>{html.escape(self.caption)}</figcaption>\n</figure>'
 
     def as_markdown(self, figures: str) -> str:
         caption = _plain(self.caption)
@@ -117,7 +160,7 @@ class Page:
 
     def __init__(self, title: str):
         self.title = title
-        self._blocks: list[_Heading | _Text | _Code | _Table | _Figure] = []
+        self._blocks: list[_Heading | _Text | _Code | _Details | _Live | _Table | _Figure] = []
 
     def heading(self, text: str, level: int = 2) -> None:
         """A heading of level 2 to 4; the title is level 1."""
@@ -132,6 +175,17 @@ class Page:
     def code(self, text: str) -> None:
         """Commands or a listing, line by line."""
         self._blocks.append(_Code(text))
+
+    def details(self, summary: str, text: str) -> None:
+        """A listing that is folded away under its summary."""
+        self._blocks.append(_Details(summary, text))
+
+    def live(self, style: str, script: str, data: Any, said: str) -> None:
+        """A part that a script of ours fills: the element `live`, from the data in `live-data`. One a page.
+
+        style, script: files of this package. said: what stands in Markdown instead.
+        """
+        self._blocks.append(_Live(style, script, embedded(data), said))
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> None:
         """A table; every row has as many cells as there are columns. Raises ValueError for one that has not."""
@@ -156,11 +210,17 @@ class Page:
     def html(self) -> str:
         """The whole page as one HTML file."""
         title = html.escape(self.title)
+        live = [block for block in self._blocks if isinstance(block, _Live)]
+        scripts = " ".join(f"'{digest(block.script)}'" for block in live) or "'none'"
+        policy = f"{_POLICY}; script-src {scripts}"
+        style = "\n".join([theme(), _STYLE, *(block.style for block in live)])
         blocks = "\n".join(block.as_html() for block in self._blocks)
         return (
             f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">\n'
+            '<meta name="color-scheme" content="light dark">\n'
             f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{title}</title>\n'
-            f"<style>\n{_STYLE}\n</style>\n</head>\n<body>\n<h1>{title}</h1>\n{blocks}\n</body>\n</html>\n"
+            f"<style>\n{style}\n</style>\n</head>\n<body>\n<h1>{title}</h1>\n{blocks}\n</body>\n</html>\n"
         )
 
     def markdown(self, figures: str) -> str:
@@ -178,8 +238,6 @@ class Page:
         figures = f"{name}-figures"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            page = folder / f"{name}.html"
-            page.write_text(self.html(), encoding="utf-8")
             (folder / f"{name}.md").write_text(self.markdown(figures), encoding="utf-8")
             for figure in self._figures():
                 (folder / figures).mkdir(exist_ok=True)
@@ -188,7 +246,15 @@ class Page:
             raise UserError(
                 f"cannot write {name}.html into {folder}: {reason(error)}; choose another --out"
             ) from error
-        return page
+        return self.write_html(folder / f"{name}.html")
+
+    def write_html(self, path: Path) -> Path:
+        """Write the page as one HTML file and return where it is. Raises UserError where it cannot be written."""
+        try:
+            path.write_text(self.html(), encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {reason(error)}; choose another --out") from error
+        return path
 
     def _figures(self) -> list[_Figure]:
         return [block for block in self._blocks if isinstance(block, _Figure)]

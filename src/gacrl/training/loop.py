@@ -14,7 +14,7 @@ import numpy as np
 from gacrl import tasks
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.metrics import EpisodeSummary
-from gacrl.render import num_frames
+from gacrl.reel import num_frames
 from gacrl.training.ahead import Ahead, Programs, prepare
 from gacrl.training.devices import gathered, wait_for_all
 from gacrl.training.divergence import require_finite, require_sound_task

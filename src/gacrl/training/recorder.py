@@ -119,6 +119,13 @@ class RunFolder:
             return {}
         return made if isinstance(made, dict) else {}
 
+    def begun_from(self) -> str | None:
+        """Return the run that this one started from; None where it started from nothing, or does not say."""
+        try:
+            return json.loads(self.origin_file.read_text(encoding="utf-8")).get("from")
+        except (OSError, ValueError, AttributeError, RecursionError):
+            return None
+
     def warn_of_changed_task(self, warn: Callable[[str], None]) -> None:
         """Say that a task from outside is no longer what it was when the run was made. It goes on all the same."""
         made, own = self._made(), tasks.brought(self.config().task)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, SupportsIndex
 import jax
 import jax.numpy as jnp
 
-from gacrl import render, tasks
+from gacrl import reel, tasks
 from gacrl.config import files as configuration
 from gacrl.config.checks import whole
 from gacrl.config.presets import label
@@ -336,7 +336,7 @@ def _show(folder: RunFolder, config: RunConfig, shown: list[episodes.Episode]) -
             episode.save(folder.episodes / f"{number}.npz")
         if shown and shown[0].visible:
             title = f"{label(config)}, seed {config.seed}"
-            render.gif(shown, folder.gif, title=title, words=task.words)
+            reel.gif(shown, folder.gif, title=title, words=task.words)
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: AbstractTrainer) -> Learner:

@@ -324,12 +324,12 @@ class Trainer(AbstractTrainer):
 
         return map_seeds(one, self.mesh)(learners)
 
-    @partial(jax.jit, static_argnums=(0, 2, 3))
-    def record(self, learner: Learner, stream: Stream, num_episodes: int) -> Played:
-        """K greedy episodes of one seed's learner as they happen, the very ones that `evaluate` measures."""
+    @partial(jax.jit, static_argnums=(0, 2, 3, 4))
+    def record(self, learner: Learner, stream: Stream, num_episodes: int, explore: bool = False) -> Played:
+        """K episodes of one seed's learner as they happen, the very ones that `evaluate` measures."""
         return play(
             self.evaluation_env,
-            self.algorithm.policy(learner, False),
+            self.algorithm.policy(learner, explore),
             self.memory,
             self.evaluation_params,
             stream_key(stream),

@@ -24,7 +24,7 @@ from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison, Pair, compare
 from gacrl.experiments.compare.data import to_dict, to_marl_eval
 from gacrl.experiments.compare.marl_eval import from_marl_eval
-from gacrl.experiments.compare.report import write_page
+from gacrl.experiments.compare.pages import write_page
 
 REFERENCES = {
     who: {"return_agent_mean": value, "coverage_final_0.1": coverage, "collisions": 1.0}
@@ -343,7 +343,7 @@ def test_a_run_that_diverged_at_once_or_over_another_horizon_has_no_curve(make_r
     ]
     found = compare(runs)
     assert [group.evaluated_at for group in found.groups] == [EVALUATED_AT, (), ()]
-    page = write_page(found, tmp_path / "page").read_text(encoding="utf-8")
+    page = write_page(found, tmp_path / "page", "").read_text(encoding="utf-8")
     assert page.count("Without evaluations along training: b, c.") == 2 * 2, (
         "in text and for screen readers, two metrics"
     )
@@ -406,7 +406,7 @@ def test_the_command_prints_and_writes_everything(
     for column in ("first less second", "would show from", "chance first is better", "shown better"):
         assert f"\n{column}: " in text, "explained where it stands"
     page = (out / "comparison.html").read_text(encoding="utf-8")
-    assert page.count("<figure>") == 6
+    assert page.count("<figure class=") == 6
     assert r"-15.000 \[" in (out / "comparison.md").read_text(encoding="utf-8")
     assert {path.stem for path in (out / "comparison-figures").iterdir()} == {
         f"{metric}-{kind}"
@@ -538,7 +538,7 @@ def test_a_page_of_single_seeds(make_run: MakeRun, tmp_path: Path, capsys: pytes
     runs = [str(make_run("a", VDN, [-8.0])), str(make_run("b", MAPPO, [-8.0], evaluated_at=()))]
     assert main(["compare", *runs, "--metric", "collisions", "--out", str(tmp_path / "page")]) == 0
     assert "8.000 (one seed: no interval)" in capsys.readouterr().out
-    assert (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8").count("<figure>") == 3
+    assert (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8").count("<figure class=") == 3
 
 
 # Refusals.

@@ -48,7 +48,7 @@ function pointer(act, view) {
     canvas.setPointerCapture(event.pointerId);
     act.grab(thing);
   });
-  canvas.addEventListener("pointermove", (event) => act.drag(...view.worldAt(event)));
+  canvas.addEventListener("pointermove", (event) => act.drag(...view.worldAt(event), view.wordAt(event)));
   for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, act.drop);
   canvas.addEventListener("pointerleave", () => act.hover(null));
 }

@@ -2,6 +2,7 @@
 
 import { connect } from "./controls.js";
 import { byId, make, say } from "./elements.js";
+import { aboutWord } from "./explain.js";
 import { drawCurves, drawGauges } from "./gauges.js";
 import { Inspector } from "./inspector.js";
 import { understood, written } from "./link.js";
@@ -142,8 +143,8 @@ const act = {
   grab(thing) {
     if (!page.replays) still.held = { ...thing, moved: false };
   },
-  drag(x, y) {
-    if (still.held === null) return act.hover(act.nearest(x, y, 1.2));
+  drag(x, y, word) {
+    if (still.held === null) return act.hover(word ?? act.nearest(x, y, 1.2));
     still.held.moved = true;
     return changed({ kind: "move", thing: still.held.thing, index: still.held.index, x, y });
   },
@@ -155,8 +156,12 @@ const act = {
     const { thing, index } = still.selected, it = session.main.frames[now()].scene[thing === "agent" ? "agents" : "marks"][index];
     if (it) changed({ kind: "move", thing, index, x: it.x + dx, y: it.y + dy });
   },
+  // What a word goes with stands in the picture while the pointer is over it.
   hover(thing) {
     still.hovered = thing;
+    const about = thing?.symbol === undefined ? null : aboutWord(page.dictionary, thing.index, thing.round, thing.symbol, page);
+    byId("word").hidden = about === null;
+    say(byId("word"), about ?? "");
     view.canvas.style.cursor = thing === null ? "default" : page.replays ? "pointer" : "grab";
   },
   copy() {

@@ -56,7 +56,8 @@ export class Recording {
   work() {}
 }
 
-function framesOf(replay) {
+// What is to be seen in each step of a recorded episode, as a session has it.
+export function framesOf(replay) {
   const parts = { agents: discs(replay.agents), marks: discs(replay.marks) };
   const words = replay.words && numbers(replay.words), hears = replay.hears && numbers(replay.hears);
   const reward = numbers(replay.reward).values, ground = [...numbers(replay.ground).values];

@@ -14,6 +14,7 @@ export class SceneView {
     this.pen = canvas.getContext("2d");
     this.colours = colours;
     this.size = 0;
+    this.words = [];
   }
 
   // Fit the canvas to its place on the page, sharp on every screen.
@@ -30,6 +31,7 @@ export class SceneView {
     this.fit();
     const now = Math.min(Math.floor(t), frames.length - 1), frame = frames[now], next = frames[now + 1] ?? frame;
     const fraction = t - now;
+    this.words = [];
     this.theme = extra.theme;
     this.view = extra.area;
     const agents = frame.scene.agents.map((agent, i) => this.between(agent, next.scene.agents[i], fraction));
@@ -69,6 +71,13 @@ export class SceneView {
       this.view.x + ((event.clientX - box.left) * ratio - this.size / 2) / this.scale(),
       this.view.y - ((event.clientY - box.top) * ratio - this.size / 2) / this.scale(),
     ];
+  }
+
+  // The word whose bubble is under a point of the page; null where there is none.
+  wordAt(event) {
+    const box = this.canvas.getBoundingClientRect(), ratio = this.size / box.width;
+    const [x, y] = [(event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio];
+    return this.words.findLast((word) => Math.hypot(word.x - x, word.y - y) < word.size) ?? null;
   }
 
   ground(scene) {
@@ -222,17 +231,18 @@ export class SceneView {
 
   // What is heard of an agent: a letter for each round. A line through it: nobody does; under it: it said something else.
   bubble(decision, agent, index, fate, crowded) {
-    const symbols = decision.arrived.map((round) => round[index]).filter((symbol) => symbol >= 0);
-    if (symbols.length === 0) return;
+    const spoken = decision.arrived.map((words, round) => ({ round, symbol: words[index] })).filter(({ symbol }) => symbol >= 0);
+    if (spoken.length === 0) return;
     const size = (crowded ? 5.5 : 11) * this.unit, away = (Math.max(agent.radius, 6 * this.unit) + size * 0.6) * Math.SQRT1_2;
     const x = agent.x + away, y = agent.y - away;
-    symbols.forEach((symbol, k) => {
+    spoken.forEach(({ round, symbol }, k) => {
       const colour = this.symbol(symbol), at = x + 1.8 * size * k;
+      this.words.push({ thing: "agent", index, round, symbol, x: at, y, size });
       this.circle(at, y, size + 1.5 * this.unit, this.theme.paper);
       this.circle(at, y, size, colour, fate?.kind === "silence" ? 0.35 : 1);
       this.text(letter(symbol), at, y, size * (symbol >= 26 ? 1 : 1.35), fate?.kind === "silence" ? INK : readableOn(colour));
     });
-    const end = x + 1.8 * size * (symbols.length - 1);
+    const end = x + 1.8 * size * (spoken.length - 1);
     if (fate?.kind === "silence") this.line([x - size, y + size * 0.9], [end + size, y - size * 0.9], this.theme.alarm, 3);
     else if (fate) this.line([x - size, y + size * 1.35], [end + size, y + size * 1.35], this.theme.alarm, 3, fate.kind === "speak" ? [] : [4, 3]);
   }
