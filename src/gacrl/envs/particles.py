@@ -5,11 +5,13 @@ processor's vector units then run over worlds, where a single one has only pairs
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from gacrl.scene import Edit, Placed
 
 NO_ACTION, LEFT, RIGHT, DOWN, UP = range(5)
 DIRECTIONS = ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
@@ -109,3 +111,28 @@ def coast(
     kept, dt = 1 - physics.damping, physics.time_step
     effect = dt * (1 + kept)
     return positions + (dt + effect * kept) * velocities, effect * dt * physics.action_force
+
+
+class Places(Protocol):
+    """A state of a particle world: a named tuple with these arrays, and others."""
+
+    @property
+    def positions(self) -> Float[Array, "N 2"]: ...
+    @property
+    def velocities(self) -> Float[Array, "N 2"]: ...
+    @property
+    def landmarks(self) -> Float[Array, "L 2"]: ...
+    def _replace(self, **changed: Array) -> Self: ...
+
+
+def edited(state: Places, hand: Edit) -> Places:
+    """Return the state after a hand has put agents, at rest, and landmarks somewhere else."""
+    return state._replace(
+        positions=_put(hand.agents, state.positions),
+        velocities=jnp.where(hand.agents.moved[:, None], 0.0, state.velocities),
+        landmarks=_put(hand.marks, state.landmarks),
+    )
+
+
+def _put(placed: Placed, positions: Float[Array, "K 2"]) -> Float[Array, "K 2"]:
+    return jnp.where(placed.moved[:, None], jnp.asarray(placed.positions, positions.dtype), positions)
