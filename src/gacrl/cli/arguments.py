@@ -257,6 +257,38 @@ class Export:
 
 
 @dataclass(frozen=True)
+class View:
+    """Show a policy live, on a page in the browser: silence it, speak in its place, drag, add agents, scrub and rewind.
+
+    RUN is a run folder, FOLDER@k, FOLDER@best, pretrained:NAME, or a scripted policy of the task. Two of them play the
+    same starts side by side. A run that is being trained plays with its newest parameters, its curves beside it. Flags
+    --env.X change the task's settings, as in `gacrl evaluate`.
+
+    examples:
+      gacrl view pretrained:gacrl-reference           pip install 'gacrl[view]'
+      gacrl view runs/gacrl-1 oracle
+      gacrl view runs/mine-1 --env FILE.py:NAME
+      gacrl view told --env reference --port 0
+    """
+
+    run: tyro.conf.Positional[tuple[str, ...]]
+    """One policy, or two."""
+    sampled: bool = False
+    """Explore as in training, instead of playing greedily."""
+    num_agents: int | None = None
+    """Begin with another number of agents (short for --env.num-agents)."""
+    host: str = "127.0.0.1"
+    """The address to listen on. Any other than this one lets other machines in, if they have the page's address."""
+    port: int = 8642
+    """The port to listen on; 0 takes any that is free."""
+    open: bool = False
+    """Open the page in a browser."""
+    outside: ON_TASK = Outside()
+    json: bool = False
+    """Also print the page's address as a JSON object."""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare finished runs: interquartile means over seeds with 95 % intervals, differences, chances to be better.
 

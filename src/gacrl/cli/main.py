@@ -16,6 +16,7 @@ from gacrl import tasks
 from gacrl.cli import output, stopwatch, studies
 from gacrl.cli.export import export
 from gacrl.cli.stopping import stopping
+from gacrl.cli.view import view
 from gacrl.cli.words import Words
 from gacrl.config import files as configuration
 from gacrl.config import presets
@@ -40,6 +41,7 @@ usage: gacrl COMMAND [OPTIONS]
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
   render     watch a run, random, noop or oracle: a GIF, MP4 or strip of pictures
+  view       watch a run live in the browser, and meddle: silence, speak, drag, add agents
   export     take a run elsewhere: weights, a program, a page to play with, its numbers
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
@@ -510,6 +512,7 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "resume": _resume,
     "evaluate": _evaluate,
     "render": _render,
+    "view": view,
     "export": export,
     "compare": _compare,
     "reproduce": studies.reproduce,
@@ -522,7 +525,7 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "doctor": _doctor,
 }
 _ON_TASK = (
-    *("train", "resume", "evaluate", "render", "export", "compare"),
+    *("train", "resume", "evaluate", "render", "view", "export", "compare"),
     *("ablate", "talk", "sweep", "tasks", "config"),
 )
 """Commands that take a task from outside."""

@@ -45,10 +45,14 @@ class Playable(NamedTuple):
 class Player:
     """A policy, its newest parameters, and the rooms that it plays in, each made when it is first needed."""
 
-    def __init__(self, name: str, task: Task, settings: Any, make: Callable[[Any], Playable], learner: Learner) -> None:
+    def __init__(
+        self, name: str, task: Task, settings: Any, make: Callable[[Any], Playable], learner: Learner
+    ) -> None:
         """make: settings of the task -> the policy in it."""
         self.name, self.task, self.settings, self._make = name, task, settings, make
         self.learner, self.env_steps = learner, 0
+        self.opened: TrainedRun | None = None
+        """None for a scripted policy."""
         self.nearest: int | None = None
         """So many neighbours an agent listens to at the most; None: all."""
         self.reach: float | None = None
@@ -234,7 +238,7 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
         return Playable(env, policy, trainer.memory)
 
     player = Player(name, opened.task, opened.config.env, make, acting(opened))
-    player.env_steps = opened.env_steps
+    player.opened, player.env_steps = opened, opened.env_steps
     network = getattr(opened.config.algorithm, "network", None)
     if network is not None:
         player.nearest, player.reach = network.nearest_agents, network.radius

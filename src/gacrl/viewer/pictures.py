@@ -10,7 +10,9 @@ from gacrl.scene import Discs
 from gacrl.viewer.rooms import Decided, Meddling
 
 
-def picture(decided: Decided, count: int, meddling: Meddling | None, nearest: int | None, size: float) -> dict[str, Any]:
+def picture(
+    decided: Decided, count: int, meddling: Meddling | None, nearest: int | None, size: float
+) -> dict[str, Any]:
     """Write down what was decided in one environment, on the host: the first `count` agents are there.
 
     nearest: so many neighbours an agent listens to at the most. size: the radius of agents without one.

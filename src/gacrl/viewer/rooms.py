@@ -84,7 +84,9 @@ class Room:
         self.env, self.memory, self.places = env, memory, int(env.num_agents)
         self._reset = jax.jit(partial(_reset, env))
         self._step = jax.jit(partial(_step, env, memory, measures))
-        self._decide = jax.jit(partial(_decide, env, policy, look, reach))  # with meddling, and without: two programs
+        self._decide = jax.jit(
+            partial(_decide, env, policy, look, reach)
+        )  # with meddling, and without: two programs
         self._edit = None if edit is None else jax.jit(partial(_edited, env, edit))
         self._seen = jax.jit(env.seen_in)
         self.marks = 0
@@ -136,8 +138,9 @@ class Room:
     def warm(self, learner: Learner, params: EnvParams) -> None:
         """Compile all programs by playing a step, so that nobody waits for them later."""
         stood = self.reset(params, 0)
-        decided = self.decide(learner, params, stood, 0, 0, None)
-        self.step(params, stood.state, decided, 0, 0)
+        for t in range(2):  # what a step leaves may be typed otherwise than what a reset does
+            decided = self.decide(learner, params, stood, 0, t, None)
+            stood, _ = self.step(params, stood.state, decided, 0, t)
         if self.words is not None:
             rounds, agents, _ = self.words
             meddling = Meddling(
@@ -147,9 +150,12 @@ class Room:
                 kept=np.ones((agents, agents), bool),
                 radius=np.float32(0.0),
             )
-            self.decide(learner, params, stood, 0, 0, meddling)
+            self.decide(learner, params, stood, 0, 2, meddling)
         if self._edit is not None:
-            placed = (Placed(np.zeros((count, 2), np.float32), np.zeros(count, bool)) for count in (self.places, self.marks))
+            placed = (
+                Placed(np.zeros((count, 2), np.float32), np.zeros(count, bool))
+                for count in (self.places, self.marks)
+            )
             self.edited(params, stood, Edit(*placed))
 
 
@@ -218,7 +224,9 @@ def _decide(
     decided, decision = rollout.decide(policy_of(learner), carry, keys, happens)
     scene = seen_of(look, carry.env_state, carry.observation, params)
     assert scene is not None, "whoever opens a policy asks whether there is something to see"
-    after, chosen, shown = jax.tree.map(lambda leaf: leaf[0], (decided.memory, decision._replace(extras=()), scene))
+    after, chosen, shown = jax.tree.map(
+        lambda leaf: leaf[0], (decided.memory, decision._replace(extras=()), scene)
+    )
     return Decided(after, chosen.action, chosen.messages, chosen.adjacency, shown)
 
 

@@ -34,9 +34,7 @@ def params(settings: SpreadSettings, numbers: SpreadParams, places: int, count: 
     )
 
 
-def join(
-    settings: SpreadSettings, state: SpreadState, fresh: SpreadState, before: int, now: int
-) -> SpreadState:
+def join(settings: SpreadSettings, state: SpreadState, fresh: SpreadState, before: int, now: int) -> SpreadState:
     """Put newcomers, and the landmarks that come with them, where a fresh start has them."""
 
     def joined(old: Array, new: Array, first: int) -> Array:
