@@ -52,7 +52,10 @@ def _place(module: str, texts: Mapping[str, str], placed: dict[str, str], above:
     placed[module] = _EXPORT.sub("", _IMPORT.sub("", text))
 
 
-MADE_BY = "Made by <code>gacrl export --format html</code>. It runs in your browser alone: nothing is loaded, nothing is sent."
+MADE_BY = (
+    "Made by <code>gacrl export --format html</code>. "
+    "It runs in your browser alone: nothing is loaded, nothing is sent."
+)
 """What an exported page says of itself."""
 
 

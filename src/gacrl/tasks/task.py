@@ -58,7 +58,7 @@ class Team(NamedTuple):
     params: Callable[[Settings, EnvParams, int, int], EnvParams]
     """(settings as asked for, params of a room with masks, its places, agents that are there) -> params."""
     join: Callable[[Settings, EnvState, EnvState, int, int], EnvState]
-    """(settings of the room, state, a fresh one, agents before, and now) -> the state with newcomers of the fresh one."""
+    """(settings of the room, state, a fresh one, agents before, now) -> the state, newcomers as in the fresh one."""
 
 
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:

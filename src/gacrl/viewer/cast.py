@@ -71,7 +71,7 @@ class Player:
     def team(self) -> tuple[int, int]:
         """How few and how many agents it can play with."""
         team = self.task.team
-        if team is None or self.most is not None and self.most <= self.home:
+        if team is None or (self.most is not None and self.most <= self.home):
             return self.home, self.home
         most = team.most if self.most is None else min(self.most, team.most)
         return min(team.least(self.settings), self.home), max(most, self.home)

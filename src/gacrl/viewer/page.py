@@ -7,7 +7,10 @@ from gacrl.export import bundle
 from gacrl.export.html import common
 from gacrl.viewer.cast import Cast
 
-_MADE_BY = "Served by <code>gacrl view</code>: the policy itself plays, in the process that printed the address of this page."
+_MADE_BY = (
+    "Served by <code>gacrl view</code>: "
+    "the policy itself plays, in the process that printed the address of this page."
+)
 
 
 def page(cast: Cast, host: str) -> str:

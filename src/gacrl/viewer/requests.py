@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
@@ -181,7 +181,7 @@ def _scene(fields: _Fields, bounds: Bounds) -> Wanted:
 
 
 def _require_order(events: tuple[Event, ...], count: int, bounds: Bounds) -> None:
-    if any(later.at < earlier.at for earlier, later in zip(events, events[1:], strict=False)):
+    if any(later.at < earlier.at for earlier, later in pairwise(events)):
         raise Refused("events stand in the order of their steps")
     for event in events:
         count += (event.kind == "add") - (event.kind == "remove")

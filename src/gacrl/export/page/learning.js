@@ -11,13 +11,13 @@ export function drawLearning(news) {
     const canvas = make("canvas", { id: "learning-curve", role: "img" });
     const section = make("section", { id: "learning" }, make("h2", {}, "How it learns"), make("p", { id: "learning-step" }), canvas);
     byId("curves").closest("section").after(section);
-    new ResizeObserver(() => draw()).observe(canvas);
+    new ResizeObserver(() => plot()).observe(canvas);
   }
   shown = news;
-  draw();
+  plot();
 }
 
-function draw() {
+function plot() {
   const { label, steps, seeds, playing } = shown, canvas = byId("learning-curve"), last = steps.at(-1);
   const best = seeds.map((values) => values.at(-1).toFixed(2)).join(", ");
   say(byId("learning-step"), `${label}: ${best} after ${last.toLocaleString("en")} steps. The policy that plays has ${playing.toLocaleString("en")}; a new start takes the newest.`);

@@ -10,7 +10,7 @@ const OPENING = 3;  // the seed that opens a page
 const AHEAD = 24;  // frames that are asked for before they are shown
 const PACE = 40;  // milliseconds between two messages of a hand that drags
 const MOST = 64;  // frames in one message
-const LOST = 5000;  // milliseconds without an answer after which everything is asked for once more
+const SILENCE = 5000;  // milliseconds without an answer after which everything is asked for once more
 const AGAIN = 1500;  // milliseconds until a lost server is looked for again
 
 // The session of a page, once its first frame is there, and what its address asks for, or null.
@@ -86,12 +86,13 @@ class Served extends Story {
     this.line.send({ kind: "scene", version: this.version, ...this.start, events: this.events });
     this.wanted = this.fresh - 1;
     this.heard = performance.now();
+    this.work(this.fresh);
   }
 
   // Ask for the frames up to step t, and some more, before they are needed.
   work(t) {
     if (this.paced !== null || !this.line.open) return;
-    if (this.fresh <= this.wanted && performance.now() - this.heard > LOST) {
+    if (this.fresh <= this.wanted && performance.now() - this.heard > SILENCE) {
       this.tell();
       return;
     }
