@@ -16,7 +16,7 @@ from gacrl import tasks
 from gacrl.cli import output, stopwatch, studies
 from gacrl.cli.export import export
 from gacrl.cli.stopping import stopping
-from gacrl.cli.view import view
+from gacrl.cli.view import shown, view
 from gacrl.cli.words import Words
 from gacrl.config import files as configuration
 from gacrl.config import presets
@@ -140,6 +140,7 @@ def _run(command: str, words: list[str]) -> int:
         return _COMMANDS[command](rest)
     if command not in _ON_TASK:
         raise UserError(f"`gacrl {command}` takes no {'--env' if named['--env'] else '--use'}")
+    rest.named = named
     with contextlib.ExitStack() as blame:
         for file in named["--use"]:
             from gacrl.tasks import own
@@ -187,7 +188,7 @@ def _train(words: Words) -> int:
         parent = None if asked.begin_from is None else play.parent(asked.begin_from, watcher.warn)
         return session.start(config, asked.out, watcher, parent)
 
-    return _watched(start, asked, config)
+    return _watched(start, asked, config, words)
 
 
 @contextlib.contextmanager
@@ -205,7 +206,7 @@ def _horizon(config: RunConfig) -> int:
     return tasks.find(config.task).make(config.env).max_cycles if steps is None else steps
 
 
-def _resume(words: list[str]) -> int:
+def _resume(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     asked = parsing.parse(arguments.Resume, words, "resume")
@@ -225,7 +226,7 @@ def _resume(words: list[str]) -> int:
 
         return session.resume(asked.run, asked.extend, watcher)
 
-    return _watched(resume, asked, config)
+    return _watched(resume, asked, config, words)
 
 
 def _diagnose(asked: "Resume") -> int:
@@ -247,7 +248,9 @@ def _diagnose(asked: "Resume") -> int:
     return 0
 
 
-def _watched(work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", config: RunConfig) -> int:
+def _watched(
+    work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", config: RunConfig, words: Words
+) -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
     cluster = asked.cluster
     cluster.check()
@@ -267,8 +270,9 @@ def _watched(work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", conf
         stopping(terminal),
         distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
         tracked(() if terminal.quiet else track, watcher.warn) as tracking,
+        shown(asked.page, words, terminal) as page,
     ):
-        run = work(watcher + tracking)
+        run = work(watcher + tracking + page)
     terminal.report(run)
     if asked.json and not terminal.quiet:
         print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))

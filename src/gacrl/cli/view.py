@@ -1,13 +1,20 @@
 """The command that shows a policy live."""
 
+import contextlib
 import json
 import sys
 import webbrowser
-from typing import Any
+from collections.abc import Generator
+from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
 from gacrl.cli.words import Words
 from gacrl.extras import require_extra
+
+if TYPE_CHECKING:
+    from gacrl.cli.arguments import Page
+    from gacrl.cli.terminal import TerminalWatcher
+    from gacrl.training.watching import Watcher
 
 PACKAGES = ("starlette", "uvicorn", "websockets")
 
@@ -45,6 +52,21 @@ def view(words: Words) -> int:
             webbrowser.open(server.address)
         server.run()
     return 0
+
+
+@contextlib.contextmanager
+def shown(page: "Page", words: Words, terminal: "TerminalWatcher") -> "Generator[Watcher]":
+    """Serve a page beside a training, where one is asked for; one process of several does."""
+    from gacrl.training.watching import Watcher
+
+    if not page.view or terminal.quiet:
+        yield Watcher()
+        return
+    require_extra("view", *PACKAGES)
+    from gacrl.viewer.beside import page_beside
+
+    with page_beside(page.view_host, page.view_port, words.named, terminal.note) as watcher:
+        yield watcher
 
 
 def _warn(sentence: str) -> None:

@@ -1,12 +1,10 @@
 """What is new about a run while its page is open: the curves of its evaluations, and newer parameters."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from gacrl import play
-from gacrl.errors import UserError
 from gacrl.play import TrainedRun
 from gacrl.tasks.task import Task
 from gacrl.training.recorder import RunFolder
@@ -19,16 +17,16 @@ _MOST_POINTS = 400
 """Of a curve."""
 
 
-def follow(cast: Cast, board: Board, stopped: Callable[[], bool] = lambda: False) -> None:
+def follow(cast: Cast, board: Board) -> None:
     """Tell pages how the first run among the players learns, and let it play with its newest parameters.
 
-    Ends with the run. Scripted policies learn nothing.
+    Returns when the run has its summary. Scripted policies learn nothing.
     """
     player = next((player for player in cast.players if player.opened is not None), None)
     if player is None or player.opened is None:
         return
     folder, seen = play.folder_of(player.name), -1.0
-    while not stopped():
+    while True:
         written = _written(folder.metrics_file)
         if written != seen:
             seen = written
@@ -52,7 +50,7 @@ def _look(player: Player, opened: TrainedRun, folder: RunFolder, task: Task, boa
         if newer is not None:
             player.opened, player.learner, player.env_steps = newer, acting(newer), newer.env_steps
         curves = learning(folder.metrics(), task)
-    except (UserError, OSError):
+    except Exception:  # what is read is being written: the next look finds it whole
         return
     if curves is not None:
         board.put("learning", **curves, playing=player.env_steps)

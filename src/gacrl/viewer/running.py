@@ -18,9 +18,6 @@ from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
 
-PORT = 8642
-"""Where a page is found unless another port is asked for."""
-
 
 def new_token() -> str:
     """Draw the secret of an address."""
@@ -112,14 +109,13 @@ def warm_up(cast: Cast) -> None:
         player.room(player.home).warm(player.learner, player.params(player.home, player.home))
 
 
-def warm_up_the_rest(cast: Cast, stopped: Callable[[], bool] = lambda: False) -> None:
+def warm_up_the_rest(cast: Cast) -> None:
     """Compile the rooms for other numbers of agents, smallest first, at a low priority."""
     with contextlib.suppress(AttributeError, OSError):  # where threads have a priority of their own
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
     for size in cast.players[0].sizes[1:]:
         for player in cast.players:
-            if not stopped():
-                player.room(size).warm(player.learner, player.params(size, size))
+            player.room(size).warm(player.learner, player.params(size, size))
 
 
 def beside(work: Callable[[], None]) -> threading.Thread:

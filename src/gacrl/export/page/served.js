@@ -179,7 +179,7 @@ function frameOf(shown) {
     said: shown.said, arrived: shown.arrived, hears: shown.hears, heeded: [], looks: agents.map(() => []), actions: shown.actions,
   };
   return {
-    scene: dressed(agents, marks, shown.lines, shown.ground), decision, share: shareLit(marks),
+    scene: dressed(agents, marks, shown.lines, shown.ground), decision, share: shown.measured.share ?? shareLit(marks),
     totals: { return: shown.earned, collisions: 0, ...shown.measured },
   };
 }
