@@ -5,7 +5,7 @@ processor's vector units then run over worlds, where a single one has only pairs
 """
 
 from functools import partial
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,20 +113,11 @@ def coast(
     return positions + (dt + effect * kept) * velocities, effect * dt * physics.action_force
 
 
-class Places(Protocol):
-    """A state of a particle world: a named tuple with these arrays, and others."""
+def edited(state: Any, hand: Edit) -> Any:
+    """Return the state of a particle world after a hand has put agents, at rest, and landmarks somewhere else.
 
-    @property
-    def positions(self) -> Float[Array, "N 2"]: ...
-    @property
-    def velocities(self) -> Float[Array, "N 2"]: ...
-    @property
-    def landmarks(self) -> Float[Array, "L 2"]: ...
-    def _replace(self, **changed: Array) -> Self: ...
-
-
-def edited(state: Places, hand: Edit) -> Places:
-    """Return the state after a hand has put agents, at rest, and landmarks somewhere else."""
+    state: a named tuple with positions [N, 2], velocities [N, 2] and landmarks [L, 2].
+    """
     return state._replace(
         positions=_put(hand.agents, state.positions),
         velocities=jnp.where(hand.agents.moved[:, None], 0.0, state.velocities),
