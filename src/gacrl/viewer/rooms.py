@@ -159,12 +159,12 @@ class Room:
             self.edited(params, stood, Edit(*placed))
 
 
-def _key(seed: Any, t: Any, purpose: int) -> PRNGKey:
+def _key(seed: Any, t: Any, purpose: Any) -> PRNGKey:
     return jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(stream_key("view"), seed), t), purpose)
 
 
 def _reset(
-    env: Environment, params: EnvParams, seed: Any, t: Any = 0, purpose: int = START
+    env: Environment, params: EnvParams, seed: Any, t: Any = 0, purpose: Any = START
 ) -> tuple[EnvState, Observation]:
     return env.reset(_key(seed, t, purpose), params)
 
