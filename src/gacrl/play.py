@@ -110,8 +110,13 @@ def newer(opened: TrainedRun) -> TrainedRun | None:
     Raises UserError where it has gone.
     """
     path, _, kind = _split(opened.name)
-    found, _ = checkpoint.newest(RunFolder.open(path).checkpoints, kind)
-    return open_one(opened.name, lambda _: opened.config.env) if found.env_steps > opened.env_steps else None
+    folder = RunFolder.open(path)
+    found, _ = checkpoint.newest(folder.checkpoints, kind)
+    if found.env_steps <= opened.env_steps:
+        return None
+    if folder.config().num_seeds > 1:
+        return open_one(opened.name, lambda _: opened.config.env)
+    return replace(opened, learners=session.load_learners(found, opened.trainer), env_steps=found.env_steps)
 
 
 def folder_of(run: str | Path) -> RunFolder:
