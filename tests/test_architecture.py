@@ -42,6 +42,7 @@ LAYERS = (
     ("training",),
     ("experiments", "play", "api"),
     ("export",),
+    ("viewer",),
     ("cli", "doctor"),
     ("__main__",),
 )

@@ -31,8 +31,8 @@ COMMANDS = [
 PYTHON = [block for language, block in BLOCKS if language == "python"]
 GUIDE = (ROOT / "docs" / "guides" / "python.md").read_text(encoding="utf-8")
 
-LONG = {"ablate", "doctor", "reproduce", "sweep", "talk"}
-"""Minutes each: the first is below, the others have tests of their own in tests/experiments."""
+LONG = {"ablate", "doctor", "reproduce", "sweep", "talk", "view"}
+"""Minutes each, or until Ctrl-C: the first is below, the others have tests of their own."""
 
 pytestmark = pytest.mark.xdist_group("readme")
 

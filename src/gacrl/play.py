@@ -104,6 +104,21 @@ def open_one(
     return open_run(f"{path}@{member or 0}{'@best' if kind == checkpoint.BEST else ''}", change, warn)
 
 
+def newer(opened: TrainedRun) -> TrainedRun | None:
+    """Open a run again where it has newer parameters by now, in the task that it is played in; None where it has not.
+
+    Raises UserError where it has gone.
+    """
+    path, _, kind = _split(opened.name)
+    folder = RunFolder.open(path)
+    found, _ = checkpoint.newest(folder.checkpoints, kind)
+    if found.env_steps <= opened.env_steps:
+        return None
+    if folder.config().num_seeds > 1:
+        return open_one(opened.name, lambda _: opened.config.env)
+    return replace(opened, learners=session.load_learners(found, opened.trainer), env_steps=found.env_steps)
+
+
 def folder_of(run: str | Path) -> RunFolder:
     """Return the run folder that `RUN` names. Raises UserError where there is none."""
     return RunFolder.open(_split(str(run))[0])

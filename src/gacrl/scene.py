@@ -27,6 +27,21 @@ class Discs(NamedTuple):
     """An index into the palette of symbols, or `PLAIN`."""
 
 
+class Placed(NamedTuple):
+    """Where a hand puts K things."""
+
+    positions: Float[Array | np.ndarray, "*b K 2"]
+    moved: Bool[Array | np.ndarray, "*b K"]
+    """False for what it leaves alone."""
+
+
+class Edit(NamedTuple):
+    """What a hand does to a moment: agents and marks in the order of the scene. Lengths in the task's own units."""
+
+    agents: Placed
+    marks: Placed
+
+
 class Scene(NamedTuple):
     """One moment of one environment."""
 

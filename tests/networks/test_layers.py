@@ -41,7 +41,9 @@ def test_weights_without_a_gain_are_uniform_within_the_root_of_the_inputs(nets: 
                 assert np.abs(numbers).max() < limit
             share = np.sort(np.ravel(layer.weight)) / limit / 2 + 0.5
             even = (np.arange(share.size) + 0.5) / share.size
-            assert np.abs(share - even).max() < 1.63 / share.size**0.5  # Kolmogorov and Smirnov's, one in a hundred
+            assert (
+                np.abs(share - even).max() < 1.63 / share.size**0.5
+            )  # Kolmogorov and Smirnov's, one in a hundred
         assert np.abs(net.score.weight).max() < 64**-0.5
 
 

@@ -11,6 +11,9 @@ from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 
+HOST, PORT = "127.0.0.1", 8642
+"""Where a page is found unless something else is asked for."""
+
 
 @dataclass(frozen=True)
 class Cluster:
@@ -77,6 +80,18 @@ class Messages:
         return "".join(" ".join((name, *map(str, values))) for name, values in given.items())
 
 
+@dataclass(frozen=True)
+class Page:
+    """A page beside the training."""
+
+    view: bool = False
+    """Serve a page on which the policy plays while it learns, its curves beside (pip install 'gacrl[view]')."""
+    view_host: str = HOST
+    """The address that the page listens on. Any other than this one lets other machines in."""
+    view_port: int = PORT
+    """Its port; 0 takes any that is free."""
+
+
 MESSAGES = Annotated[Messages, tyro.conf.arg(name="")]
 ON_TASK = Annotated[Outside, tyro.conf.arg(name="")]
 
@@ -112,6 +127,7 @@ class Train:
       gacrl train --env pettingzoo:mpe2.simple_spread_v3 --env.N 4    an environment of PettingZoo
       gacrl train --from runs/gacrl-1                 start with the policy of a run
       gacrl train --track tensorboard,trackio         pip install 'gacrl[track]'
+      gacrl train --view                              watch it learn; pip install 'gacrl[view]'
     """
 
     settings: Annotated[Settings, tyro.conf.arg(name="")]
@@ -128,6 +144,7 @@ class Train:
     """The run folder; none: the next free one under runs/. One that exists is never overwritten."""
     track: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
     """Also write every evaluation elsewhere: csv, tensorboard, trackio, wandb, or several with commas."""
+    page: Annotated[Page, tyro.conf.arg(name="")] = Page()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -152,6 +169,7 @@ class Resume:
     outside: ON_TASK = Outside()
     track: Annotated[str, tyro.conf.arg(metavar="NAMES")] = ""
     """Also write every evaluation elsewhere: csv, tensorboard, trackio, wandb, or several with commas."""
+    page: Annotated[Page, tyro.conf.arg(name="")] = Page()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -254,6 +272,38 @@ class Export:
     """Replace a file that exists."""
     json: bool = False
     """Make the last line of the output one JSON object."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a policy live, on a page in the browser: silence it, speak in its place, drag, add agents, scrub and rewind.
+
+    RUN is a run folder, FOLDER@k, FOLDER@best, pretrained:NAME, or a scripted policy of the task. Two of them play the
+    same starts side by side. A run that is being trained plays with its newest parameters, its curves beside it. Flags
+    --env.X change the task's settings, as in `gacrl evaluate`.
+
+    examples:
+      gacrl view pretrained:gacrl-reference           pip install 'gacrl[view]'
+      gacrl view runs/gacrl-1 oracle
+      gacrl view runs/mine-1 --env FILE.py:NAME
+      gacrl view told --env reference --port 0
+    """
+
+    run: tyro.conf.Positional[tuple[str, ...]]
+    """One policy, or two."""
+    sampled: bool = False
+    """Explore as in training, instead of playing greedily."""
+    num_agents: int | None = None
+    """Begin with another number of agents (short for --env.num-agents)."""
+    host: str = HOST
+    """The address to listen on. Any other than this one lets other machines in, if they have the page's address."""
+    port: int = PORT
+    """The port to listen on; 0 takes any that is free."""
+    open: bool = False
+    """Open the page in a browser."""
+    outside: ON_TASK = Outside()
+    json: bool = False
+    """Also print the page's address as a JSON object."""
 
 
 @dataclass(frozen=True)

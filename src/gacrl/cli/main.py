@@ -18,6 +18,7 @@ from gacrl.cli.compare import compare
 from gacrl.cli.export import export
 from gacrl.cli.output import warn
 from gacrl.cli.stopping import stopping
+from gacrl.cli.view import shown, view
 from gacrl.cli.words import Words
 from gacrl.config import files as configuration
 from gacrl.config import presets
@@ -42,6 +43,7 @@ usage: gacrl COMMAND [OPTIONS]
   resume     go on exactly where a run stopped, or past its end
   evaluate   measure a run, random, noop or oracle, here or in the real MPE2
   render     watch a run, random, noop or oracle: a GIF, MP4 or strip of pictures
+  view       watch a run live in the browser, and meddle: silence, speak, drag, add agents
   export     take a run elsewhere: weights, a program, a page to play with, its numbers
   compare    runs side by side: intervals over seeds, differences, what else differs
   reproduce  the paper's experiment: every table, figure and claim, theirs beside ours
@@ -140,6 +142,7 @@ def _run(command: str, words: list[str]) -> int:
         return _COMMANDS[command](rest)
     if command not in _ON_TASK:
         raise UserError(f"`gacrl {command}` takes no {'--env' if named['--env'] else '--use'}")
+    rest.named = named
     with contextlib.ExitStack() as blame:
         for file in named["--use"]:
             from gacrl.tasks import own
@@ -187,7 +190,7 @@ def _train(words: Words) -> int:
         parent = None if asked.begin_from is None else play.parent(asked.begin_from, watcher.warn)
         return session.start(config, asked.out, watcher, parent)
 
-    return _watched(start, asked, config)
+    return _watched(start, asked, config, words)
 
 
 @contextlib.contextmanager
@@ -205,7 +208,7 @@ def _horizon(config: RunConfig) -> int:
     return tasks.find(config.task).make(config.env).max_cycles if steps is None else steps
 
 
-def _resume(words: list[str]) -> int:
+def _resume(words: Words) -> int:
     from gacrl.cli import arguments, parsing
 
     asked = parsing.parse(arguments.Resume, words, "resume")
@@ -225,7 +228,7 @@ def _resume(words: list[str]) -> int:
 
         return session.resume(asked.run, asked.extend, watcher)
 
-    return _watched(resume, asked, config)
+    return _watched(resume, asked, config, words)
 
 
 def _diagnose(asked: "Resume") -> int:
@@ -247,7 +250,9 @@ def _diagnose(asked: "Resume") -> int:
     return 0
 
 
-def _watched(work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", config: RunConfig) -> int:
+def _watched(
+    work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", config: RunConfig, words: Words
+) -> int:
     """Train under the eyes of the terminal; Ctrl-C ends after the chunk under way, a second one at once."""
     cluster = asked.cluster
     cluster.check()
@@ -267,8 +272,9 @@ def _watched(work: Callable[["Watcher"], "Ended"], asked: "Train | Resume", conf
         stopping(terminal),
         distributed.joined(place, configuration.dumps(config), cluster.wait, terminal.watcher()) as watcher,
         tracked(() if terminal.quiet else track, watcher.warn) as tracking,
+        shown(asked.page, words, terminal) as page,
     ):
-        run = work(watcher + tracking)
+        run = work(watcher + tracking + page)
     terminal.report(run)
     if asked.json and not terminal.quiet:
         print(json.dumps({"folder": str(run.folder), "env_steps": run.env_steps, "summary": run.summary}))
@@ -471,6 +477,7 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "resume": _resume,
     "evaluate": _evaluate,
     "render": _render,
+    "view": view,
     "export": export,
     "compare": compare,
     "reproduce": studies.reproduce,
@@ -483,7 +490,7 @@ _COMMANDS: dict[str, Callable[[Any], int]] = {
     "doctor": _doctor,
 }
 _ON_TASK = (
-    *("train", "resume", "evaluate", "render", "export", "compare"),
+    *("train", "resume", "evaluate", "render", "view", "export", "compare"),
     *("ablate", "talk", "sweep", "tasks", "config"),
 )
 """Commands that take a task from outside."""

@@ -99,6 +99,10 @@ class TerminalWatcher:
     def _print(self, line: str) -> None:
         say(self._console, line)
 
+    def note(self, line: str) -> None:
+        """Print a line that belongs to the run, from any thread."""
+        self._print_whole(line)
+
     def _print_whole(self, line: str) -> None:
         """For a line with a path, which is to be copied: there are no line breaks in it."""
         self._console.print(line, soft_wrap=True)

@@ -154,6 +154,13 @@ class Environment(ABC):
         """What is seen in each of E states, for a task that `observes_state`."""
         raise NotImplementedError
 
+    def seen_in(self, state: EnvState, params: EnvParams = ()) -> Observation | None:
+        """Return what is seen in a state that a hand has changed; None where only the next step can tell."""
+        if not self.observes_state:
+            return None
+        one = jax.tree.map(lambda leaf: leaf[None], state)
+        return jax.tree.map(lambda leaf: leaf[0], self.observe_many(one, params))
+
 
 def typed_keys(keys: Array) -> Key[Array, "..."]:
     """Return keys as JAX's key arrays, whose shape is that of the copies; those of `jax.random.PRNGKey` are wrapped."""

@@ -5,11 +5,13 @@ processor's vector units then run over worlds, where a single one has only pairs
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from gacrl.scene import Edit, Placed
 
 NO_ACTION, LEFT, RIGHT, DOWN, UP = range(5)
 DIRECTIONS = ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
@@ -109,3 +111,19 @@ def coast(
     kept, dt = 1 - physics.damping, physics.time_step
     effect = dt * (1 + kept)
     return positions + (dt + effect * kept) * velocities, effect * dt * physics.action_force
+
+
+def edited(state: Any, hand: Edit) -> Any:
+    """Return the state of a particle world after a hand has put agents, at rest, and landmarks somewhere else.
+
+    state: a named tuple with positions [N, 2], velocities [N, 2] and landmarks [L, 2].
+    """
+    return state._replace(
+        positions=_put(hand.agents, state.positions),
+        velocities=jnp.where(hand.agents.moved[:, None], 0.0, state.velocities),
+        landmarks=_put(hand.marks, state.landmarks),
+    )
+
+
+def _put(placed: Placed, positions: Float[Array, "K 2"]) -> Float[Array, "K 2"]:
+    return jnp.where(placed.moved[:, None], jnp.asarray(placed.positions, positions.dtype), positions)

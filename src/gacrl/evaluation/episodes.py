@@ -69,10 +69,7 @@ class Episode:
     @property
     def symbols(self) -> Int[np.ndarray, "T R N"] | None:
         """Return the most likely symbol of each message; −1 for one that says nothing or is not made of symbols."""
-        if self.messages is None:
-            return None
-        distribution = (self.messages >= 0).all(-1) & (np.abs(self.messages.sum(-1) - 1) < 1e-3)
-        return np.where(distribution, self.messages.argmax(-1), -1)
+        return None if self.messages is None else said_symbols(self.messages)
 
     def save(self, path: Path) -> None:
         """Write the episode as an .npz of plain arrays. Raises OSError where the file cannot be written."""
@@ -88,6 +85,12 @@ class Episode:
         except Exception as error:  # numpy and zipfile raise a dozen kinds over a broken file
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(f"{path} is not a recorded episode: {reason}") from error
+
+
+def said_symbols(messages: Float[np.ndarray, "*b V"]) -> Int[np.ndarray, "*b"]:
+    """Return the most likely symbol of each message; −1 for one that says nothing or is not made of symbols."""
+    distribution = (messages >= 0).all(-1) & (np.abs(messages.sum(-1) - 1) < 1e-3)
+    return np.where(distribution, messages.argmax(-1), -1)
 
 
 _REQUIRED = ("actions", "reward", "reward_raw", "agent_mask")

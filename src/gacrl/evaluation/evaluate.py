@@ -16,8 +16,8 @@ from gacrl.evaluation.metrics import Tally, count_step_if, episode_metrics, no_s
 from gacrl.tasks.task import RETURN, Metric
 from gacrl.types import Intervention, Memory, Policy, PRNGKey
 
-Stream = Literal["training", "monitor", "gate", "report"]
-"""Random streams that never meet: training, the evaluations along the way, success gates, and the report."""
+Stream = Literal["training", "monitor", "gate", "report", "view"]
+"""Random streams that never meet: training, evaluations along the way, success gates, the report, the live page."""
 
 _EVALUATION_SEED = 20_260_101
 """The starts of evaluation episodes are the same for every run, seed and scripted policy."""

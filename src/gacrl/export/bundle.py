@@ -6,7 +6,7 @@ stand one after the other in a single script: imports and the word `export` are 
 
 import html
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from types import MappingProxyType
 from typing import Any
@@ -52,13 +52,30 @@ def _place(module: str, texts: Mapping[str, str], placed: dict[str, str], above:
     placed[module] = _EXPORT.sub("", _IMPORT.sub("", text))
 
 
-def page(title: str, data: Mapping[str, Any]) -> str:
-    """Return the page. Its policy lets it run its own script and style, and load nothing; texts are escaped."""
-    code, style = script("main.js"), theme() + source("page.css")
+MADE_BY = (
+    "Made by <code>gacrl export --format html</code>. "
+    "It runs in your browser alone: nothing is loaded, nothing is sent."
+)
+"""What an exported page says of itself."""
+
+
+def page(
+    title: str,
+    data: Mapping[str, Any],
+    texts: Mapping[str, str] = MappingProxyType({}),
+    connects: Sequence[str] = (),
+    made_by: str = MADE_BY,
+) -> str:
+    """Return the page. Its policy lets it run its own script and style, and load nothing; texts are escaped.
+
+    texts: of modules that stand in for the page's own. connects: where it may connect to. made_by: HTML of our own.
+    """
+    code, style = script("main.js", texts), theme() + source("page.css")
     allowed = (
         "default-src 'none'",
         f"script-src '{digest(code)}'",
         f"style-src '{digest(style)}'",
+        *((f"connect-src {' '.join(connects)}",) if connects else ()),
         "base-uri 'none'",
         "form-action 'none'",
     )
@@ -68,5 +85,6 @@ def page(title: str, data: Mapping[str, Any]) -> str:
         "style": style,
         "data": embedded(data),
         "script": code,
+        "made_by": made_by,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))

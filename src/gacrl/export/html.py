@@ -19,6 +19,7 @@ from gacrl.export.yardsticks import yardsticks
 from gacrl.messages import interventions
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
+from gacrl.tasks.task import Task
 from gacrl.types import Intervention
 
 MOST_BYTES = 400_000
@@ -32,7 +33,7 @@ _UNBOUNDED = 12
 def write(source: Source, out: Path) -> Sequence[Path]:
     """Write a page of at most 400 KB that needs no server. Raises UserError where nothing can be shown."""
     opened = source.opened
-    data = _common(opened, source.name)
+    data = common(opened.task, opened.config.env, Path(source.name).name)  # it goes elsewhere
     live = _live(opened)
     data |= _recorded(opened) if live is None else live
     text = bundle.page(f"{data['title']} · gacrl", data)
@@ -47,14 +48,14 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     return [out]
 
 
-def _common(opened: TrainedRun, name: str) -> dict[str, Any]:
-    """What every page says of its run."""
-    task, words = opened.task, opened.task.words
+def common(task: Task, settings: Any, name: str) -> dict[str, Any]:
+    """Return what every page says of its policies. name: theirs, without the folders of this machine."""
+    words = task.words
     return {
-        "title": f"{task.name}: {Path(name).name}",  # the page goes elsewhere: not the folders of this machine
+        "title": f"{task.name}: {name}",
         "task": task.name,
         "summary": task.summary,
-        "actions": list(task.actions(opened.config.env)),
+        "actions": list(task.actions(settings)),
         "words": {"agent": words.agent, "mark": words.mark, "lit": words.lit},
         "colours": replays.COLOURS,
         "measures": {},

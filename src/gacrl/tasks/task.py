@@ -48,6 +48,19 @@ class Part(NamedTuple):
     changes: Mapping[str, Any]
 
 
+class Team(NamedTuple):
+    """How agents join and leave while a policy is watched. They fill the first of the places that there are."""
+
+    least: Callable[[Settings], int]
+    most: int
+    room: Callable[[Settings, int], Settings]
+    """(settings, N) -> the same task with places for N agents."""
+    params: Callable[[Settings, EnvParams, int, int], EnvParams]
+    """(settings as asked for, params of a room with masks, its places, agents that are there) -> params."""
+    join: Callable[[Settings, EnvState, EnvState, int, int], EnvState]
+    """(settings of the room, state, a fresh one, agents before, now) -> the state, newcomers as in the fresh one."""
+
+
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
     """Nothing about the task is a number that could change between steps."""
     return ()
@@ -111,7 +124,9 @@ class Task(NamedTuple):
     scene: Callable[[Settings, EnvState, EnvParams], Any] | None = None
     """What a picture of a state shows (`gacrl.scene`). None: discs, where positions are known."""
     edit: Callable[[EnvState, Any], EnvState] | None = None
-    """What a hand may move."""
+    """(state, `gacrl.scene.Edit`) -> the state after it: what a hand may move. None: nothing."""
+    team: Team | None = None
+    """None: always as many agents as the settings say."""
     world: Callable[[Any, EnvParams], Mapping[str, Any] | None] | None = None
     """(Environment, params) -> its rules as plain data, for a page that steps the task in JavaScript (`export/page`);
     None: such a page replays what was recorded."""

@@ -13,7 +13,7 @@ export function drawGauges(page, session, t) {
   if (page.measures[COLLISIONS]) rows.push(["Collisions", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
   const comparable = session.start.count === page.world?.num_agents && main.scene.agents.length === session.start.count;
   const yardsticks = comparable ? names : [];
-  const head = ["", twin ? "Here" : "Now", ...(twin ? ["Untouched"] : []), ...yardsticks];
+  const head = ["", session.names?.main ?? (twin ? "Here" : "Now"), ...(twin ? [session.names?.twin ?? "Untouched"] : []), ...yardsticks];
   const cells = rows.map(([label, of, measure, format]) => [
     label, format(of(main)), ...(twin ? [format(of(twin))] : []),
     ...yardsticks.map((name) => (t === 0 && measure !== "share" ? format(0) : format(page.yardsticks[name][measure][Math.max(t - 1, 0)]))),
@@ -36,8 +36,8 @@ export function drawCurves(canvas, page, session, t, theme) {
   const lane = (frames) => frames.slice(0, t + 1).map((frame) => frame.totals.return);
   const known = session.main.frames[t].scene.agents.length === page.world?.num_agents ? page.yardsticks : {};
   const curves = Object.entries(known).map(([name, it]) => ({ name, values: [0, ...it.return], colour: theme.faint, dash: [4, 3] }));
-  if (session.meddled) curves.push({ name: "untouched", values: lane(session.twin.frames), colour: theme.edge, dash: [] });
-  curves.push({ name: session.meddled ? "here" : "now", values: lane(session.main.frames), colour: session.meddled ? theme.alarm : theme.edge, dash: [] });
+  if (session.meddled) curves.push({ name: session.names?.twin ?? "untouched", values: lane(session.twin.frames), colour: theme.edge, dash: [] });
+  curves.push({ name: session.names?.main ?? (session.meddled ? "here" : "now"), values: lane(session.main.frames), colour: session.meddled ? theme.alarm : theme.edge, dash: [] });
   const least = Math.min(-1e-6, ...curves.flatMap((curve) => curve.values)), most = Math.max(0, ...curves.flatMap((curve) => curve.values));
   const at = (k, value) => [4 + ((width - 84) * k) / session.length, 8 + ((height - 16) * (most - value)) / (most - least)];
   const labels = [];

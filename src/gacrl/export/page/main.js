@@ -5,45 +5,28 @@ import { byId, make, say } from "./elements.js";
 import { aboutWord } from "./explain.js";
 import { drawCurves, drawGauges } from "./gauges.js";
 import { Inspector } from "./inspector.js";
-import { understood, written } from "./link.js";
-import { NavigationWorld } from "./navigation.js";
+import { written } from "./link.js";
+import { open } from "./opening.js";
 import { theme } from "./palette.js";
-import { policyFrom } from "./policy.js";
-import { Recording } from "./recording.js";
 import { areaOf, SceneView } from "./scene.js";
-import { edgeName, Session } from "./session.js";
-import { SpreadWorld } from "./spread.js";
+import { edgeName } from "./story.js";
 import { verdict } from "./verdict.js";
 import { Voices } from "./voices.js";
 
-const WORLDS = { spread: SpreadWorld, navigation: NavigationWorld };
 const SPEEDS = [2, 5, 10, 25];  // steps a second
 const WORK = 7;  // milliseconds of each frame for steps to come
-const FIRST = 3;  // the seed that opens a page: a start in which agents with goals have different ones
 const REST = 1800;  // milliseconds between an episode and the next one
 
 const page = JSON.parse(byId("data").textContent);
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const still = { t: 0, playing: false, speed: 5, selected: null, hovered: null, held: null, over: 0 };
 
-function open() {
-  if (page.replays) {
-    const fresh = new Recording(page.replays, { seed: 0, count: 0 });
-    const asked = understood(location.hash, fresh.world, fresh.policy);
-    return { session: asked === null ? fresh : new Recording(page.replays, asked, asked.events), asked };
-  }
-  const world = new WORLDS[page.world.kind](page.world), policy = policyFrom(page.network);
-  const asked = understood(location.hash, world, policy);
-  const start = asked === null ? { seed: FIRST, count: page.world.num_agents } : { seed: asked.seed, count: asked.count };
-  return { session: new Session(world, policy, start, asked?.events ?? []), asked };
-}
-
-const { session, asked } = open();
+const { session, asked } = await open(page);
 const view = new SceneView(byId("scene"), page.colours), twinView = new SceneView(byId("twin"), page.colours);
 
-// The step that is shown: computed by now.
+// The step that is shown: computed by now, or the last one that is.
 function now() {
-  return Math.min(Math.floor(still.t), session.length);
+  return Math.min(Math.floor(still.t), session.newest);
 }
 
 function settle() {
@@ -141,7 +124,7 @@ const act = {
     return best === undefined ? null : { thing: best.thing, index: best.index };
   },
   grab(thing) {
-    if (!page.replays) still.held = { ...thing, moved: false };
+    if (session.movable) still.held = { ...thing, moved: false };
   },
   drag(x, y, word) {
     if (still.held === null) return act.hover(word ?? act.nearest(x, y, 1.2));
@@ -152,7 +135,7 @@ const act = {
     still.held = null;
   },
   nudge(dx, dy) {
-    if (page.replays || still.selected === null) return;
+    if (!session.movable || still.selected === null) return;
     const { thing, index } = still.selected, it = session.main.frames[now()].scene[thing === "agent" ? "agents" : "marks"][index];
     if (it) changed({ kind: "move", thing, index, x: it.x + dx, y: it.y + dy });
   },
@@ -162,7 +145,7 @@ const act = {
     const about = thing?.symbol === undefined ? null : aboutWord(page.dictionary, thing.index, thing.round, thing.symbol, page);
     byId("word").hidden = about === null;
     say(byId("word"), about ?? "");
-    view.canvas.style.cursor = thing === null ? "default" : page.replays ? "pointer" : "grab";
+    view.canvas.style.cursor = thing === null ? "default" : session.movable ? "grab" : "pointer";
   },
   copy() {
     write();
@@ -197,7 +180,7 @@ function write() {
 
 // Time passes: one step after another, as far as they are computed.
 function advance(milliseconds) {
-  session.work(Math.min(now() + 1, session.length), WORK);
+  session.work(Math.min(Math.floor(still.t) + 1, session.length), WORK);
   if (!still.playing) return;
   if (now() >= session.length) {
     still.over += milliseconds;
@@ -218,11 +201,13 @@ function draw() {
   const t = now(), rules = session.standing(t), meddled = session.meddled;
   const selected = still.hovered ?? still.selected ?? null;
   byId("right").hidden = !meddled;
-  say(byId("left-name"), meddled ? "With what you changed" : "");
+  say(byId("left-name"), session.names?.main ?? (meddled ? "With what you changed" : ""));
+  if (session.names !== null) say(byId("right-name"), session.names.twin);
   const lanes = [session.main, ...(meddled ? [session.twin] : [])];
   const area = areaOf(lanes.flatMap((lane) => lane.frames.slice(0, t + 2)));
-  view.draw(session.main.frames, still.t, { rules, selected, theme: colours, area });
-  if (meddled) twinView.draw(session.twin.frames, still.t, { rules: { fates: {}, cuts: new Set() }, selected, theme: colours, area });
+  const moment = Math.min(still.t, session.newest);
+  view.draw(session.main.frames, moment, { rules, selected, theme: colours, area });
+  if (meddled) twinView.draw(session.twin.frames, moment, { rules: { fates: {}, cuts: new Set() }, selected, theme: colours, area });
   panels(t, rules);
 }
 
@@ -230,7 +215,7 @@ let drawn = "";
 // What changes with steps and not with frames.
 function panels(t, rules) {
   const frame = session.main.frames[t], agent = chosenAgent(), count = frame.scene.agents.length;
-  const state = JSON.stringify([t, agent, count, still.playing, session.start.seed, session.events, byId("curves").clientWidth]);
+  const state = JSON.stringify([t, agent, count, still.playing, session.start.seed, session.events, session.revision, byId("curves").clientWidth]);
   if (state === drawn) return;
   drawn = state;
   say(byId("play"), still.playing ? "Pause" : "Play");
@@ -267,10 +252,11 @@ function introduce() {
   const talks = page.replays ? page.replays.silenced.length > 0 : page.network.settings.communication !== "none";
   say(byId("invitation"), invitation(talks));
   byId("talk").hidden = byId("hush").hidden = !talks;
-  byId("hands").hidden = Boolean(page.replays);
   byId("team").hidden = session.world.most === session.world.least;
-  byId("reach").hidden = page.world?.kind !== "spread";
-  byId("cutting").hidden = !talks;
+  byId("reach").hidden = !(talks && session.reaches);
+  byId("cutting").hidden = !talks || Boolean(page.replays);
+  byId("drag").hidden = !session.movable;
+  byId("hands").hidden = ["team", "reach", "cutting", "drag"].every((id) => byId(id).hidden);
   say(byId("drag"), `Drag agents and ${page.words.mark}s in the picture, also while they run.`);
 }
 

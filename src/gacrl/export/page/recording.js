@@ -1,5 +1,7 @@
 // Recorded episodes under the controls of a session: for tasks and networks that the page cannot step itself.
 
+import { dressed, shareLit } from "./dressing.js";
+
 const NUMBERS = { float32: Float32Array, int16: Int16Array };
 
 export class Recording {
@@ -10,6 +12,8 @@ export class Recording {
     const count = this.episodes[0][0].scene.agents.length;
     this.world = { least: count, most: count, length: Math.max(...this.episodes.map((frames) => frames.length - 1)) };
     this.policy = { settings: { rounds: 0, vocabulary: 0 } };
+    this.movable = this.reaches = false;
+    this.names = null;
     this.start = start;
     this.events = events.filter((event) => event.kind === "fate");
   }
@@ -20,6 +24,10 @@ export class Recording {
 
   get length() {
     return this.episodes[this.number].length - 1;
+  }
+
+  get newest() {
+    return this.length;
   }
 
   get meddled() {
@@ -66,15 +74,9 @@ export function framesOf(replay) {
   return Array.from({ length: replay.steps + 1 }, (_, t) => {
     if (t > 0) earned += reward[t - 1];
     const now = Math.min(t, replay.steps - 1);
-    const scene = { agents: parts.agents(t), marks: parts.marks(t), lines, ground: ground[2] > ground[0] ? ground : null };
-    for (const agent of scene.agents) {
-      agent.goal = agent.colour < 0 ? -1 : scene.marks.findIndex((mark) => mark.colour === agent.colour);
-      agent.alarm = agent.lit;
-    }
-    const there = scene.marks.filter((mark) => mark.there);
+    const scene = dressed(parts.agents(t), parts.marks(t), lines, ground);
     return {
-      scene, totals: { return: earned, collisions: 0 },
-      share: there.length ? there.filter((mark) => mark.lit).length / there.length : 0,
+      scene, totals: { return: earned, collisions: 0 }, share: shareLit(scene.marks),
       decision: decisionOf(now, scene.agents.length, words, hears, actions),
     };
   });

@@ -1,26 +1,27 @@
 // One episode in two lanes that run in lockstep: what the visitor made of it, and the same without meddling in the words.
-// A session is a seed, a number of agents, and what was done at which step: it can be scrubbed, rewound and linked to.
 
 import { randomNumbers } from "./random.js";
+import { edgeName, MEDDLING, Story } from "./story.js";
 import { arrivals } from "./words.js";
-
-// What is done to words and edges; everything else (moves, newcomers) happens in both lanes.
-const MEDDLING = new Set(["fate", "radius", "cut"]);
 
 // The same dice in both lanes, and none of the starts'.
 const NEWCOMER = 101;
 const ELSEWHERE = 7919;
 
-export class Session {
+export class Session extends Story {
   // start: {seed, count}; events: [{at, kind, …}] in the order in which they were done.
   constructor(world, policy, start, events = []) {
+    super(start, events, policy.settings.radius);
     this.world = world;
     this.policy = policy;
-    this.start = start;
-    this.events = events;
     this.length = world.length;
-    this.radius = policy.settings.radius;
+    this.reaches = Boolean(world.reaches);
     this.build();
+  }
+
+  // The last step that can be shown.
+  get newest() {
+    return this.length;
   }
 
   build() {
@@ -29,49 +30,16 @@ export class Session {
     this.elsewhere = new Lane(this, false, this.start.seed + ELSEWHERE);
   }
 
-  get meddled() {
-    return this.events.some((event) => MEDDLING.has(event.kind));
-  }
-
-  // What holds at step t: {fates, radius, cuts, count}.
-  standing(t) {
-    const rules = { fates: {}, radius: this.radius, cuts: new Set(), count: this.start.count };
-    for (const event of this.events) {
-      if (event.at > t) continue;
-      if (event.kind === "fate" && event.fate === null) delete rules.fates[event.agent];
-      else if (event.kind === "fate") rules.fates[event.agent] = event.fate;
-      else if (event.kind === "radius") rules.radius = event.value;
-      else if (event.kind === "cut" && event.on) rules.cuts.add(edgeName(event.a, event.b));
-      else if (event.kind === "cut") rules.cuts.delete(edgeName(event.a, event.b));
-      else if (event.kind === "add") rules.count += 1;
-      else if (event.kind === "remove") rules.count -= 1;
-    }
-    return rules;
-  }
-
-  // Do something at step t; whatever was to come is forgotten. A thing that is dragged has one place in each step.
   change(t, event) {
-    const same = (other) => other.at === t && other.kind === "move" && event.kind === "move"
-      && other.thing === event.thing && other.index === event.index;
-    this.events = this.events.filter((other) => other.at <= t && !same(other));
-    this.events.push({ at: t, ...event });
+    this.note(t, event);
     this.main.forget(t);
     this.elsewhere.forget(t);
     if (MEDDLING.has(event.kind)) this.twin.forget(t + 1);
     else this.twin.forget(t);
   }
 
-  // The same start again, or another one: what holds at step t holds from the beginning.
-  restart(t, seed = this.start.seed) {
-    const rules = this.standing(t), events = [];
-    for (const [agent, fate] of Object.entries(rules.fates)) events.push({ at: 0, kind: "fate", agent: Number(agent), fate });
-    if (rules.radius !== this.radius) events.push({ at: 0, kind: "radius", value: rules.radius });
-    for (const edge of rules.cuts) {
-      const [a, b] = edge.split("-").map(Number);
-      events.push({ at: 0, kind: "cut", a, b, on: true });
-    }
-    this.start = { seed, count: rules.count };
-    this.events = events;
+  restart(t, seed) {
+    this.again(t, seed);
     this.build();
   }
 
@@ -162,9 +130,4 @@ class Lane {
     velocities.fill(0, 2 * event.index, 2 * event.index + 2);
     return { ...state, positions: places, velocities };
   }
-}
-
-// Both directions between two agents.
-export function edgeName(a, b) {
-  return a < b ? `${a}-${b}` : `${b}-${a}`;
 }

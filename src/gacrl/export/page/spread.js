@@ -10,6 +10,7 @@ export class SpreadWorld {
     this.least = rules.least_agents;
     this.most = rules.most_agents;
     this.length = rules.max_cycles;
+    this.reaches = true;
     this.available = Array.from({ length: 5 }, () => true);
   }
 

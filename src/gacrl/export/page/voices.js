@@ -51,7 +51,7 @@ export class Voices {
     const rounds = this.page.network.settings.rounds, count = this.session.main.frames[0].scene.agents.length;
     const offered = Object.entries({
       free: "as spoken", swap: "swapped", scramble: "from another episode", delay: "3 steps late", drop: "half of them lost", speak: "I speak myself",
-    }).filter(([it]) => (it !== "speak" || agents.length === 1) && (it !== "swap" || count > 1));
+    }).filter(([it]) => (it !== "speak" || (agents.length === 1 && this.page.network.settings.vocabulary > 0)) && (it !== "swap" || count > 1));
     const options = offered.map(([it, label]) => make("option", { value: it, selected: it === kind }, label));
     if (kind === "silence") options.unshift(make("option", { value: "silence", selected: true }, "not at all"));
     if (kind === "") options.unshift(make("option", { value: "", selected: true }, "various"));

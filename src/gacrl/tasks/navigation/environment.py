@@ -172,6 +172,10 @@ class Navigation(Environment):
             parts.append(jnp.eye(num_agents))
         return self.from_features(jnp.concatenate(parts, axis=1))._replace(state=pack_state(state))
 
+    def seen_in(self, state: NavigationState, params: NavigationParams | None = None) -> Observation:
+        """Return what is seen in a state that a hand has changed."""
+        return self.observe(state)
+
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
         """Make the observation around what `observe` or `stack` laid out; the exact state is not known."""
         available, graph = jnp.asarray(self._available()), jnp.asarray(self._graph())

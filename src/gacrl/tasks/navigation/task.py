@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gacrl.envs.particles import PUSHES
+from gacrl.envs.particles import PUSHES, edited
 from gacrl.tasks.navigation.environment import make
 from gacrl.tasks.navigation.scene import scene
 from gacrl.tasks.navigation.scripted import centroid, guess, told
@@ -35,6 +35,7 @@ REFERENCE = Task(
     references={"told": told, "silent": centroid},
     anchors=ANCHORS / "reference.json",
     scene=scene,
+    edit=edited,
     world=world,
     comparable=("max_cycles",),
     words=Words(mark="landmark", lit="reached"),

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gacrl.config.checks import require
-from gacrl.envs.particles import PUSHES
+from gacrl.envs.particles import PUSHES, edited
 from gacrl.tasks.spread import scouts
 from gacrl.tasks.spread.environment import Spread, SpreadParams, params_of
 from gacrl.tasks.spread.scene import scene
 from gacrl.tasks.spread.scripted import local, oracle, silent
 from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SCOUTS_METRICS, ScoutsSettings, SpreadSettings
+from gacrl.tasks.spread.team import TEAM
 from gacrl.tasks.spread.world import world
 from gacrl.tasks.task import Part, Task, Words
 
@@ -82,6 +83,8 @@ TASK = Task(
     references={"oracle": oracle, "local": local},
     anchors=Path(__file__).with_name("anchors") / "spread.json",
     scene=scene,
+    edit=edited,
+    team=TEAM,
     world=world,
     comparable=COMPARABLE,
     ragged=ragged,

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gacrl.tasks.spread.environment import CAPTURE_RADIUS, Spread, SpreadParams
-
-_MOST_AGENTS = 100
+from gacrl.tasks.spread.team import MOST_AGENTS, least
 
 
 def world(env: Spread, params: SpreadParams) -> Mapping[str, Any] | None:
@@ -28,7 +27,7 @@ def world(env: Spread, params: SpreadParams) -> Mapping[str, Any] | None:
         "max_cycles": env.max_cycles,
         "arena_scale": float(params.arena_scale),
         "capture_radius": CAPTURE_RADIUS,
-        "least_agents": 1 if env.num_landmarks is None else env.num_agents,
-        "most_agents": _MOST_AGENTS,
+        "least_agents": least(env),
+        "most_agents": MOST_AGENTS,
         "measures": {"share": f"coverage_{CAPTURE_RADIUS}", "collisions": "collisions"},
     }

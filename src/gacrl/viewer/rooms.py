@@ -1,0 +1,245 @@
+"""Compiled programs that play one policy one step at a time, for a number of places that agents can fill.
+
+Who is there, what a hand moves and what happens to words are data: nothing of it compiles anything.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gacrl import rollout
+from gacrl.envs.environment import Environment, EnvParams, EnvState
+from gacrl.evaluation.episodes import Look, seen_of
+from gacrl.evaluation.evaluate import stream_key
+from gacrl.networks.graph import proximity_adjacency
+from gacrl.networks.memory import restarted
+from gacrl.scene import Edit, Placed, Scene
+from gacrl.types import Arrives, Intervention, Learner, Memory, Observation, Policy, PRNGKey
+
+START, ACT, MOVE, NEWCOMERS = range(4)
+"""What random numbers are drawn for."""
+
+
+class Meddling(NamedTuple):
+    """What happens to the words of one step, in one environment."""
+
+    values: Float[Array | np.ndarray, "R N V"]
+    replaced: Bool[Array | np.ndarray, "R N"]
+    other: Int[Array | np.ndarray, " N"]
+    """With whose words each agent is heard: its own, or another one's."""
+    kept: Bool[Array | np.ndarray, "N N"]
+    radius: Float[Array | np.ndarray, ""] | float
+    """Within which agents hear each other, where the task has space and the network a radius."""
+
+
+class Stood(NamedTuple):
+    """Where an environment stands before its agents decide."""
+
+    state: EnvState
+    seen: Observation
+    memory: Memory
+    first: bool
+
+
+class Decided(NamedTuple):
+    """What they decide there, and what there is to see."""
+
+    memory: Memory
+    action: Array
+    messages: Float[Array, "R N V"] | None
+    adjacency: Bool[Array, "N N"] | None
+    scene: Scene
+
+
+class Happened(NamedTuple):
+    """What a step brought."""
+
+    reward: Float[Array, ""]
+    measured: dict[str, Float[Array, ""]]
+    over: Bool[Array, ""]
+
+
+class Room:
+    """A policy in an environment with a fixed number of places.
+
+    policy: learner -> policy; what scripted policies learn is (). look: what is to be seen of a state. measures: which
+    measurements of a step are told. edit: what a hand may move. reach: whether the radius is the network's.
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        policy: Callable[[Learner], Policy],
+        memory: Memory,
+        look: Look | None,
+        measures: tuple[str, ...] = (),
+        edit: Callable[[EnvState, Edit], EnvState] | None = None,
+        reach: bool = False,
+    ) -> None:
+        self.env, self.memory, self.places = env, memory, int(env.num_agents)
+        self._reset = jax.jit(partial(_reset, env))
+        self._step = jax.jit(partial(_step, env, memory, measures))
+        self._decide = jax.jit(
+            partial(_decide, env, policy, look, reach)
+        )  # with meddling, and without: two programs
+        self._edit = None if edit is None else jax.jit(partial(_edited, env, edit))
+        self._seen = jax.jit(env.seen_in)
+        self.marks = 0
+        """Marks of its scene."""
+        self.words: tuple[int, int, int] | None = None
+        """[R, N, V] of what is said in a step; None for a policy that says nothing."""
+
+    def reset(self, params: EnvParams, seed: int) -> Stood:
+        """Begin an episode."""
+        return Stood(*self._reset(params, seed), self.memory, True)
+
+    def fresh(self, params: EnvParams, seed: int, t: int) -> EnvState:
+        """Return the state of another start, out of which newcomers come in step t."""
+        return self._reset(params, seed, t, NEWCOMERS)[0]
+
+    def step(
+        self, params: EnvParams, state: EnvState, decided: Decided, seed: int, t: int
+    ) -> tuple[Stood, Happened]:
+        """Step, by what was decided in step t."""
+        state, seen, memory, happened = self._step(params, state, decided.action, decided.memory, seed, t)
+        return Stood(state, seen, memory, False), happened
+
+    def edited(self, params: EnvParams, stood: Stood, hand: Edit) -> Stood:
+        """Let a hand move things. Agents see it at once, where the task can say what they see in a state."""
+        if self._edit is None:
+            return stood
+        state, seen = self._edit(params, stood.state, hand)
+        return stood._replace(state=state, seen=stood.seen if seen is None else seen)
+
+    def entered(self, params: EnvParams, state: EnvState) -> Stood:
+        """Return how a state stands here after agents have come or gone: nobody remembers anything."""
+        seen = self._seen(state, params)
+        assert seen is not None, "a task with a team says what is seen in a state"
+        return Stood(state, seen, self.memory, True)
+
+    def decide(
+        self, learner: Learner, params: EnvParams, stood: Stood, seed: int, t: int, meddling: Meddling | None
+    ) -> Decided:
+        """Let the agents decide in step t."""
+        return self._decide(learner, params, stood.state, stood.seen, stood.memory, stood.first, seed, t, meddling)
+
+    def measure(self, learner: Learner, params: EnvParams) -> None:
+        """Find out how much there is to see and to hear; nothing is computed."""
+        stood = jax.eval_shape(self._reset, params, 0)
+        found = jax.eval_shape(self._decide, learner, params, *stood, self.memory, True, 0, 0, None)
+        self.marks = found.scene.marks.radius.shape[0]
+        self.words = None if found.messages is None else found.messages.shape
+
+    def warm(self, learner: Learner, params: EnvParams) -> None:
+        """Compile all programs by playing a step, so that nobody waits for them later."""
+        stood = self.reset(params, 0)
+        for t in range(2):  # what a step leaves may be typed otherwise than what a reset does
+            decided = self.decide(learner, params, stood, 0, t, None)
+            stood, _ = self.step(params, stood.state, decided, 0, t)
+        if self.words is not None:
+            rounds, agents, _ = self.words
+            meddling = Meddling(
+                values=np.zeros(self.words, np.float32),
+                replaced=np.zeros((rounds, agents), bool),
+                other=np.arange(agents),
+                kept=np.ones((agents, agents), bool),
+                radius=np.float32(0.0),
+            )
+            self.decide(learner, params, stood, 0, 2, meddling)
+        if self._edit is not None:
+            placed = (
+                Placed(np.zeros((count, 2), np.float32), np.zeros(count, bool))
+                for count in (self.places, self.marks)
+            )
+            self.edited(params, stood, Edit(*placed))
+
+
+def _key(seed: Any, t: Any, purpose: Any) -> PRNGKey:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(stream_key("view"), seed), t), purpose)
+
+
+def _reset(
+    env: Environment, params: EnvParams, seed: Any, t: Any = 0, purpose: Any = START
+) -> tuple[EnvState, Observation]:
+    return env.reset(_key(seed, t, purpose), params)
+
+
+def _step(
+    env: Environment,
+    fresh: Memory,
+    measures: tuple[str, ...],
+    params: EnvParams,
+    state: EnvState,
+    action: Array,
+    memory: Memory,
+    seed: Any,
+    t: Any,
+) -> tuple[EnvState, Observation, Memory, Happened]:
+    state, after = env.step(state, action, _key(seed, t, MOVE), params)
+    info = rollout.measured(after)
+    memory = memory if after.left is None else restarted(fresh, memory, after.left)
+    told = {name: info[name] for name in measures}
+    return state, after.observation, memory, Happened(info["reward_raw"], told, after.terminated | after.truncated)
+
+
+def _edited(
+    env: Environment,
+    edit: Callable[[EnvState, Edit], EnvState],
+    params: EnvParams,
+    state: EnvState,
+    hand: Edit,
+) -> tuple[EnvState, Observation | None]:
+    state = edit(state, hand)
+    return state, env.seen_in(state, params)
+
+
+def _decide(
+    env: Environment,
+    policy_of: Callable[[Learner], Policy],
+    look: Look | None,
+    reach: bool,
+    learner: Learner,
+    params: EnvParams,
+    state: EnvState,
+    seen: Observation,
+    memory: Memory,
+    first: Any,
+    seed: Any,
+    t: Any,
+    meddling: Meddling | None,
+) -> Decided:
+    listening = seen
+    if meddling is not None and reach and seen.positions is not None:
+        near = proximity_adjacency(seen.positions, seen.agent_mask, jnp.asarray(meddling.radius))
+        listening = seen._replace(adjacency=near)
+    alone = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (state, listening, memory, first, meddling))
+    carry = rollout.Carry(*alone[:4], intervention=alone[4])
+    keys = jax.random.split(_key(seed, t, ACT), (1, 3))
+    happens = None if meddling is None else _MEDDLING
+    decided, decision = rollout.decide(policy_of(learner), carry, keys, happens)
+    scene = seen_of(look, carry.env_state, carry.observation, params)
+    assert scene is not None, "whoever opens a policy asks whether there is something to see"
+    after, chosen, shown = jax.tree.map(
+        lambda leaf: leaf[0], (decided.memory, decision._replace(extras=()), scene)
+    )
+    return Decided(after, chosen.action, chosen.messages, chosen.adjacency, shown)
+
+
+def _arrives(state: Meddling, ask: Callable[[Arrives], Array], first: Array, key: PRNGKey) -> Arrives:
+    """Let words arrive round by round: what is said in a round depends on what was heard in the one before."""
+    values, replaced, places = state.values, state.replaced, jnp.arange(state.other.shape[1])
+    swapped = state.other != places[None]
+    for number in range(values.shape[1]):
+        said = ask(Arrives(values, replaced, state.kept))[:, number]
+        theirs = jnp.take_along_axis(said, state.other[..., None], axis=1)
+        values = values.at[:, number].set(jnp.where(swapped[..., None], theirs, values[:, number]))
+        replaced = replaced.at[:, number].set(replaced[:, number] | swapped)
+    return Arrives(values, replaced, state.kept)
+
+
+_MEDDLING = Intervention("meddling", _arrives)

@@ -1,0 +1,118 @@
+"""What a page shows is what the policy does: the same words, places and rewards as everywhere else in the library."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import soaked
+from serving import cast_of
+
+from gacrl import rollout
+from gacrl.messages import interventions
+from gacrl.types import Arrives, Intervention
+from gacrl.viewer.cast import open_cast
+from gacrl.viewer.requests import Event, Fate, Scene
+from gacrl.viewer.show import Show
+
+SPOKEN = Arrives(
+    jnp.zeros((2, 2, 16)).at[:, 0].set(jax.nn.one_hot(jnp.array([2, 8]), 16)),
+    jnp.zeros((2, 2), bool).at[:, 0].set(True),
+)
+CASES: dict[str, tuple[Intervention | None, dict[int, Fate]]] = {
+    "nothing": (None, {}),
+    "silence": (interventions.silence([1]), {1: Fate("silence")}),
+    "swap": (interventions.swap(0, 1), {0: Fate("swap", other=1), 1: Fate("swap", other=0)}),
+    "delay": (interventions.delay(3), {0: Fate("delay"), 1: Fate("delay")}),
+    "speak": (interventions.arriving(SPOKEN), {0: Fate("speak", spoken=(2, 8))}),
+}
+
+
+def fated(fates: dict[int, Fate]) -> tuple[Event, ...]:
+    return tuple(Event(0, "fate", agent=agent, fate=fate) for agent, fate in fates.items())
+
+
+@pytest.mark.parametrize("case", soaked(CASES, "swap", "delay"))
+def test_what_happens_to_words_happens_as_in_evaluation(quick_start: None, case: str):
+    cast = cast_of("pretrained:gacrl-reference")
+    happens, fates = CASES[case]
+    show, player = Show(cast), cast.players[0]
+    show.take(Scene(5, 2, fated(fates)))
+    frames = [show.frame(t) for t in range(26)]
+    opened = player.opened
+    assert opened is not None
+    env, params, policy = opened.env, opened.trainer.evaluation_params, opened.policy(0, False)
+    carry = rollout.start(env, params, (), jax.random.key(0), 1, happens, policy)
+    start = player.room(2).reset(params, 5)
+    state, seen = jax.tree.map(lambda leaf: leaf[None], (start.state, start.seen))
+    carry = carry._replace(env_state=state, observation=seen)
+
+    def one(carry: rollout.Carry, key: jax.Array):
+        after, step = rollout.act(env, policy, params, carry, jax.random.split(key, (1, 3)), happens)
+        return after, (carry.env_state.positions, step.decision.messages.argmax(-1), step.info["reward_raw"])
+
+    _, (places, words, rewards) = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys))(
+        carry, jax.random.split(jax.random.key(4), 25)
+    )
+    mine = [frame["main"] for frame in frames]
+    shown = np.array([[frame["agents"]["x"], frame["agents"]["y"]] for frame in mine[:25]])
+    np.testing.assert_allclose(shown, np.moveaxis(np.asarray(places[:, 0]), 1, 2), atol=1e-3)
+    assert [frame["said"] for frame in mine[:25]] == words[:, 0].tolist()
+    assert mine[25]["earned"] == pytest.approx(float(rewards.sum()), abs=1e-2)
+    assert mine[25]["over"] and not mine[24]["over"]
+    assert (frames[3]["twin"] is None) == (case == "nothing")
+
+
+def test_a_moment_comes_back_and_only_what_changed_is_played_again(quick_start: None):
+    show = Show(cast_of("pretrained:gacrl-reference"))
+    show.take(Scene(3, 2))
+    first = [show.frame(t)["main"] for t in range(26)]
+    kept = list(show.main.moments)
+    show.take(Scene(3, 2, (Event(9, "move", thing="mark", index=1, place=(0.25, -0.5)),)))
+    assert [a is b for a, b in zip(show.main.moments, kept, strict=False)] == [True] * 9
+    moved = show.frame(9)["main"]
+    assert (moved["marks"]["x"][1], moved["marks"]["y"][1]) == (0.25, -0.5) and show.frame(9)["twin"] is None
+    show.take(Scene(3, 2))
+    assert [show.frame(t)["main"] for t in range(26)] == first
+    show.take(Scene(3 + 7919, 2))
+    elsewhere = [show.frame(t)["main"]["said"] for t in range(26)]
+    show.take(Scene(3, 2, fated({0: Fate("scramble"), 1: Fate("scramble")})))
+    assert [show.frame(t)["main"]["arrived"] for t in range(26)] == elsewhere
+    assert show.frame(25)["twin"] == first[25]
+
+
+def test_agents_come_and_go_and_a_radius_silences(quick_start: None):
+    """A team that grows in the middle of an episode goes on from where it stood, and plays as one that began so large."""
+    cast = cast_of("pretrained:gacrl-teams")
+    player, show = cast.players[0], Show(cast)
+    assert cast.bounds[:2] == (1, 100) and player.sizes == (5, 8, 32, 100)
+    show.take(Scene(1, 5, (Event(4, "add"), Event(4, "add"), Event(6, "remove"))))
+    before, after, fewer = (show.frame(t)["main"] for t in (3, 4, 6))
+    assert (before["count"], after["count"], fewer["count"]) == (5, 7, 6)
+    state = show.main.moments[4].state
+    assert len(after["agents"]["x"]) == 7 and sum(after["marks"]["there"]) == 7
+    moved = np.abs(np.subtract(after["agents"]["x"][:5], before["agents"]["x"])).max()
+    assert moved < 0.25 and np.isfinite(state.positions).all() and after["earned"] < before["earned"]
+    assert show.frame(5)["main"]["earned"] < after["earned"]
+    show.take(Scene(1, 7))
+    assert sum(map(len, show.frame(0)["main"]["hears"])) > 0
+    show.take(Scene(1, 7, (Event(0, "radius", value=0.01),)))
+    muted = show.frame(0)
+    assert sum(map(len, muted["main"]["hears"])) == 0 < sum(map(len, muted["twin"]["hears"]))
+    with pytest.raises(StopIteration):
+        player.places(101)
+
+
+def test_any_task_can_be_watched(quick_start: None):
+    """Cars that come and go, with the actions of a script; and two policies beside each other."""
+    cars = open_cast(["yielder"], task="traffic_junction")
+    show = Show(cars)
+    show.take(Scene(2, cars.bounds.least))
+    frames = [show.frame(t)["main"] for t in range(20)]
+    there = [sum(frame["agents"]["there"]) for frame in frames]
+    assert max(there) > 1 and len(frames[0]["lines"]) > 4 and cars.bounds.rounds == 0 and not cars.bounds.movable
+    both = open_cast(["told", "silent"], task="reference")
+    rivals = Show(both)
+    rivals.take(Scene(2, 2))
+    pair = rivals.frame(25)
+    assert rivals.frame(0)["main"]["agents"] == rivals.frame(0)["twin"]["agents"]
+    assert pair["main"]["earned"] > pair["twin"]["earned"] + 1
