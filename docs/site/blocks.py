@@ -7,7 +7,7 @@ A block is fenced as any code, and begins with `{NAME}`:
     {excerpt}   a part of another page: the file, the line it begins with, and the line that ends it
     {scores}    a task's scores: scripted policies, and runs by the files that hold their summaries
     {study}     what `gacrl talk` found, from the file that holds its summary
-    {settings}  the settings of a task, with what its source says about each
+    {settings}  the settings of a task, each with its default and what its source says about it
     {api}       docstrings of names of the package, one a line
 """
 
@@ -18,7 +18,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import tables
@@ -48,8 +48,9 @@ def fill(page: str, made: "Made", excerpt: Callable[[str, str, str], str]) -> st
         if kind not in KINDS:
             return match[0]  # one of MyST's own
         if kind == "run":
-            printed = "" if named == "quietly" else made.printed(lines(body))
-            return f"```bash\n{body}```\n{printed}"
+            if named == "quietly":
+                return f"```bash\n{body}```"
+            return "\n\n".join(f"```bash\n{asked}\n```\n\n{made.printed(asked)}" for asked in lines(body))
         if kind == "picture":
             words = shlex.split(body)
             picture = words[words.index("--out") + 1]
@@ -87,11 +88,10 @@ class Made:
             self._printed(command).write_text(done.stdout, encoding="utf-8")
         (self.folder / "done").touch()
 
-    def printed(self, asked: Iterable[str]) -> str:
-        """Return what these commands printed, as a block of text."""
-        texts = (self._printed(command).read_text(encoding="utf-8") for command in asked)
-        plain = "\n".join(line.rstrip() for text in texts for line in text.strip("\n").splitlines())
-        return f"```text\n{plain}\n```"
+    def printed(self, command: str) -> str:
+        """Return what a command printed, as a block of text."""
+        text = self._printed(command).read_text(encoding="utf-8").strip("\n")
+        return "\n".join(["```text", *map(str.rstrip, text.splitlines()), "```"])
 
     def pictures(self) -> list[Path]:
         """Return the pictures that the commands wrote into their folder."""

@@ -3,11 +3,11 @@
 import re
 from typing import Any
 
-from gacrl.versions import version
+from gacrl import versions
 
 project = "gacrl"
 author = "The gacrl authors"
-release = version()
+release = versions.version()
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["conf.py"]
 
@@ -20,16 +20,18 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 default_role = "code"
 nitpicky = True
-# Other packages' names, and axes of jaxtyping: there are no pages here to link to.
-nitpick_ignore_regex = [("py:.*", r"(?!gacrl\.).*"), ("py:class", r"gacrl\.(?!api|play|tasks\.task\b).*")]
+# Names of other packages, axes of jaxtyping, and what the package does not export: they have no entry to link to.
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!gacrl\.).*"),
+    ("py:class", r"gacrl\.(?!(api|play)\.|tasks\.task\.(Task|Metric)).*"),
+]
 
 html_theme = "furo"
 html_title = f"gacrl {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_extra_path = ["../whole"]
-html_copy_source = False
-html_theme_options = {"source_repository": ""}
+html_copy_source = html_show_copyright = False
 pygments_style, pygments_dark_style = "friendly", "native"
 
 

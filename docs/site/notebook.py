@@ -47,11 +47,12 @@ def run(path: Path, names: dict[str, Any]) -> Iterator[Shown]:
 
 
 def _value(source: str, names: dict[str, Any]) -> Any:
-    """Run a cell and return the value of its last line, None where that is no expression."""
+    """Run a cell and return the value of its last line, None where that is no expression or ends in a semicolon."""
     body = ast.parse(source).body
     last = ast.Expression(body.pop().value) if body and isinstance(body[-1], ast.Expr) else None
     exec(compile(ast.Module(body, []), "<cell>", "exec"), names)
-    return None if last is None else eval(compile(last, "<cell>", "eval"), names)
+    value = None if last is None else eval(compile(last, "<cell>", "eval"), names)
+    return None if source.rstrip().endswith(";") else value
 
 
 def _figures() -> Iterator[bytes]:

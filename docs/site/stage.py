@@ -29,6 +29,8 @@ MOVED = {
 }
 """Pages that do not lie where they are shown."""
 LINK = re.compile(r"(?<=\]\()([^)#\s]+)(#[^)\s]*)?(?=\))")
+UNTITLED = re.compile(r"(?<!!)\[(?:[\w-]+/)*[\w-]+\.md\](?=\(/)")
+"""The text of a link that only repeats a page's path: the site has its title there."""
 WHOLE = re.compile(r"\[([^\[\]]+)\]\((/[^)\s]+\.html)\)")
 """A link to an HTML file that is copied as it is: one that Sphinx leaves alone."""
 
@@ -91,7 +93,9 @@ class Stage:
             return f"/{place(path)}{anchor}"
 
         parts = re.split(r"(^```.*?^```$)", text, flags=re.DOTALL | re.MULTILINE)
-        return "".join(part if part.startswith("```") else LINK.sub(link, part) for part in parts)
+        return "".join(
+            part if part.startswith("```") else UNTITLED.sub("[]", LINK.sub(link, part)) for part in parts
+        )
 
     def add_code(self) -> None:
         """Add a page for each Python file that is linked to, and for each example."""

@@ -10,7 +10,7 @@ from sphinx.pycode import ModuleAnalyzer
 
 import gacrl
 from gacrl import tasks
-from gacrl.experiments import anchors
+from gacrl.evaluation.statistics import estimate
 
 DOCS = Path(__file__).resolve().parent.parent
 
@@ -30,25 +30,35 @@ def number(value: float) -> str:
 
 def scores(task: str, files: list[str]) -> str:
     """Return what is known of a task: policies that learn nothing, then a row for each file of docs/data."""
-    known = tasks.find(task).known()
+    known, record = tasks.find(task).known(), tasks.find(task)
+    kept = {
+        who: known.get("scripted", {}).get(who, {record.headline: score}) for who, score in known["scores"].items()
+    }
     summaries = {file: json.loads((DOCS / "data" / f"{file}.json").read_text(encoding="utf-8")) for file in files}
-    shown = tasks.find(task).shown(list(next(iter(summaries.values()))["final"]["greedy"]))
+    measured = [summary["final"]["greedy"] for summary in summaries.values()]
+    shown = record.shown(list((measured or [kept["random"]])[0]))
     rows = [
-        [f"{who}, scripted", "", *(number(of[name]) if name in of else "" for name in shown)]
-        for who, of in known["scripted"].items()
+        [who, "", *(number(of[name]) if name in of else "" for name in shown), _command(known, who)]
+        for who, of in kept.items()
     ]
-    for file, summary in summaries.items():
-        final = summary["final"]["greedy"]
-        seeds = f"{len(summary['seeds'])} × {summary['env_steps']:,}"
-        cells = [f"{number(final[name]['mean'])} {_interval(final[name]['interval'])}" for name in shown]
-        rows.append([f"[`{summary['preset']}`](/data/{file}.json)", seeds, *cells])
-    below = f"*{anchors.row(task)['summary']}. Scripted policies: `{known['command']}`. Learned ones: the mean over "
-    below += "their seeds and its 95 % interval, of the closing evaluation, greedy; their names lead to the data.*"
-    return f"{table(['policy', 'seeds × steps', *shown.values()], rows)}\n\n{below}"
+    for (file, summary), final in zip(summaries.items(), measured, strict=True):
+        cells = [_estimated(final[name]["values"]) for name in shown]
+        made = f"`{summary['command']}`" if "command" in summary else "[results](/results.md)"
+        steps = f"{len(summary['seeds'])} × {summary['env_steps']:,}"
+        rows.append([f"[`{summary['preset']}`](/data/{file}.json)", steps, *cells, made])
+    return table(["policy", "seeds × steps", *shown.values(), "made by"], rows)
 
 
-def _interval(ends: list[float]) -> str:
-    return f"[{', '.join(map(number, ends))}]"
+def _command(known: dict[str, Any], who: str) -> str:
+    """Return the command that measured a policy which learns nothing, or the best silent one."""
+    places = (known.get("scripted", {}).get(who), known.get(who), (known.get("trained") or {}).get(who), known)
+    return next((f"`{place['command']}`" for place in places if place and "command" in place), "")
+
+
+def _estimated(values: list[float]) -> str:
+    """Return the interquartile mean over seeds with its interval, as `gacrl compare` has it."""
+    point, low, high = map(number, estimate(values))
+    return f"{point} [{low}, {high}]"
 
 
 def study(file: str, _: list[str]) -> str:
@@ -66,15 +76,12 @@ def settings(task: str, _: list[str]) -> str:
         comments = ModuleAnalyzer.for_module(base.__module__).find_attr_docs()
         told |= {name: " ".join(words).strip() for (of, name), words in comments.items() if of == base.__name__}
     rows = [
-        [f"`--env.{field.name.replace('_', '-')}`", _default(field.default), told.get(field.name, "")]
+        f"- `--env.{field.name.replace('_', '-')}` ({'none' if field.default is None else field.default}): "
+        + told.get(field.name, "")
         for field in fields(kind)
         if field.init and field.default is not MISSING
     ]
-    return table(["setting", "default", "what it is"], rows)
-
-
-def _default(value: Any) -> str:
-    return f"`{value}`".replace("|", r"\|")
+    return "<details>\n<summary>Settings</summary>\n\n" + "\n".join(rows) + "\n\n</details>"
 
 
 def api(_: str, names: list[str]) -> str:
