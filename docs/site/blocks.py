@@ -4,7 +4,7 @@ A block is fenced as any code, and begins with `{NAME}`:
 
     {run}       commands, one a line; each is shown with what it prints. `{run} quietly` leaves that out
     {picture}   a command that writes a GIF or PNG by --out, which is shown; the alternative text follows the name
-    {excerpt}   a part of another page: the file, the line it begins with, and the line that ends it
+    {excerpt}   a part of another page: the file, then how it begins, then what follows it, or END
     {scores}    a task's scores: scripted policies, and runs by the files that hold their summaries
     {study}     what `gacrl talk` found, from the file that holds its summary
     {settings}  the settings of a task, each with its default and what its source says about it

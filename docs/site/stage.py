@@ -72,8 +72,11 @@ class Stage:
         def excerpt(file: str, begins: str, ends: str) -> str:
             other = (page.parent / file).resolve()
             whole = self.linked(other.read_text(encoding="utf-8"), other)
-            start = whole.index(begins)
-            return whole[start : whole.index(ends, start + len(begins))] if ends != "END" else whole[start:]
+            start = whole.find(begins)
+            end = len(whole) if ends == "END" else whole.find(ends, start + len(begins))
+            if min(start, end) < 0:
+                raise SystemExit(f"{page.relative_to(ROOT)}: {file} has no {begins!r}, or no {ends!r} behind it")
+            return whole[start:end]
 
         where = place(page)
         up = os.path.relpath(".", Path(where).parent)
