@@ -54,7 +54,10 @@ def fill(page: str, made: "Made", excerpt: Callable[[str, str, str], str]) -> st
         if kind == "picture":
             words = shlex.split(body)
             picture = words[words.index("--out") + 1]
-            return f"![{named}](/made/{picture})\n\n```bash\n{body}```"
+            shown = f"![{named}](/made/{picture})"
+            if picture.endswith(".png"):  # a strip: wide
+                shown = f'<div class="strip">\n\n{shown}\n\n</div>'
+            return f"{shown}\n\n```bash\n{body}```"
         if kind == "excerpt":
             return excerpt(named, *lines(body))
         return getattr(tables, kind)(named, lines(body))
@@ -91,6 +94,7 @@ class Made:
     def printed(self, command: str) -> str:
         """Return what a command printed, as a block of text."""
         text = self._printed(command).read_text(encoding="utf-8").strip("\n")
+        text = text.replace(f"{self.folder}/", "")  # as they are seen from there
         return "\n".join(["```text", *map(str.rstrip, text.splitlines()), "```"])
 
     def pictures(self) -> list[Path]:
@@ -104,7 +108,7 @@ class Made:
 def _digest(wanted: list[str]) -> str:
     """Tell apart lists of commands, and states of the program and of the examples."""
     told = hashlib.sha256("\n".join([*wanted, str(WIDTH)]).encode())
-    for path in sorted([*(ROOT / "src").rglob("*"), *(ROOT / "examples").rglob("*")]):
+    for path in sorted([*(ROOT / "src").rglob("*"), *(ROOT / "examples").rglob("*.py")]):
         if path.is_file() and "__pycache__" not in path.parts:
             told.update(path.read_bytes())
     return told.hexdigest()[:16]

@@ -134,7 +134,8 @@ class Stage:
             print("the tour", flush=True)
             with tempfile.TemporaryDirectory() as empty, contextlib.chdir(empty):
                 shutil.copy(ROOT / "examples" / "own_task.py", empty)
-                kept.write_text(notebook.page(list(notebook.run(tour, {}))), encoding="utf-8")
+                page = notebook.page(list(notebook.run(tour, {})))
+                kept.write_text(page.replace(f"{Path.cwd()}/", ""), encoding="utf-8")
         self.write(place(tour), self.linked(kept.read_text(encoding="utf-8"), tour))
 
 
