@@ -30,6 +30,13 @@ lint: $(STAMP)
 types: $(STAMP)
 	"$(BIN)/pyright"
 
+docs: $(STAMP)  ## the site, in build/site/html; what commands print there is run again where the program changed
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt --editable ".[dev,docs]"
+	"$(BIN)/python" docs/site/stage.py build/site
+	rm -rf build/site/html
+	"$(BIN)/python" -m sphinx --fail-on-warning --keep-going --quiet build/site/source build/site/html
+	@echo "the site: build/site/html/index.html"
+
 bench: $(STAMP)  ## side by side with peers, in environments of their own; fails where a ratio has fallen
 	"$(BIN)/python" benchmarks/guard.py
 	"$(BIN)/python" benchmarks/paper_schedule.py
@@ -42,7 +49,7 @@ release:  ## wheel and sdist, each tried in a fresh environment from another fol
 
 lock:  ## pin what CI installs anew: the newest of everything that pyproject.toml allows
 	"$(PYTHON)" -m venv .venv-lock
-	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check ".[dev]"
+	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check ".[dev,docs]"
 	{ echo "# What CI installs; made by \`make lock\`. Nightly builds are left out: registries drop them."; \
 	  .venv-lock/bin/python -m pip freeze --exclude gacrl | grep -v nightly; } > constraints.txt
 	rm -rf .venv-lock

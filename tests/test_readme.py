@@ -1,15 +1,18 @@
-"""Every command of the README works, and every line of Python in it and in the guide to Python, word for word.
+"""Every command of the README and of the guides works, and every line of Python in them, word for word.
 
-The presets are small ones here, and evaluations short; nothing else is changed.
+The presets are small ones here, and trainings and evaluations short; nothing else is changed.
 """
 
 import re
 import shlex
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from conftest import SCRIPTED_ROW
@@ -33,6 +36,19 @@ GUIDE = (ROOT / "docs" / "guides" / "python.md").read_text(encoding="utf-8")
 
 LONG = {"ablate", "doctor", "reproduce", "sweep", "talk", "view"}
 """Minutes each, or until Ctrl-C: the first is below, the others have tests of their own."""
+GUIDES = sorted(path.stem for path in (ROOT / "docs" / "guides").glob("*.md"))
+ELSEWHERE = {
+    "cluster": "several machines, and Ray: tests/training/test_distributed.py, tests/experiments/test_ray_search.py",
+    "python": "below, with what it must print",
+}
+"""Guides whose blocks are run by other tests."""
+
+GIVEN: dict[str, dict[str, Any]] = {
+    "export": {"features": np.zeros((2, 21), np.float32)},
+    "jaxmarl": {"jax": jax, "key": jax.random.key(1), "actions": {"agent_0": 0, "agent_1": 0}},
+}
+"""What the reader of a guide has already."""
+
 
 pytestmark = pytest.mark.xdist_group("readme")
 
@@ -68,7 +84,7 @@ def room_of_short_schedules(tmp_path_factory, quick_start):
     def few(run: str, episodes: int, **asked: Any) -> dict[str, Any]:
         return score_run(run, episodes=min(episodes, 4), **asked)
 
-    shortened = {name: ("short", short(presets.preset(name))) for name in ("paper", "gacrl", "ippo")}
+    shortened = {name: ("short", short(presets.preset(name))) for name in presets.PRESETS}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "PRESETS", MappingProxyType({**presets.PRESETS, **shortened}))
         patch.setattr(scoring, "score_run", few)
@@ -136,3 +152,55 @@ def test_the_python_of_its_guide(room, capsys):
     assert names["scores"]["return_agent_mean"].shape == (8, 4)
     assert set(names["actions"]) == {"agent_0", "agent_1", "agent_2"}
     assert names["policy"](np.zeros((10, names["policy"].env.observation_size))).shape == (10,)
+
+
+@pytest.fixture
+def a_room_of_its_own(room, tmp_path, monkeypatch):
+    """As the room, but empty: a guide's first run is `runs/gacrl-1`."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("guide", [guide for guide in GUIDES if guide not in ELSEWHERE])
+def test_every_block_of_a_guide(guide: str, a_room_of_its_own, capsys):
+    """One after the other, and Python in one session. Commands for what is not installed say what to install."""
+    text = (ROOT / "docs" / "guides" / f"{guide}.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {"gacrl": gacrl, **GIVEN.get(guide, {})}
+    ran = 0
+    for language, block in re.findall(r"```(bash|python)\n(.*?)```", text, flags=re.DOTALL):
+        if language == "python":
+            ran += runs_python(block, names)
+        else:
+            ran += sum([runs(shlex.split(line, comments=True), capsys) for line in block.splitlines()])
+    if not ran:
+        pytest.skip("all of it needs what is not installed")
+
+
+def runs_python(block: str, names: dict[str, Any]) -> bool:
+    """Run Python of a guide, unless it needs what is not installed: onnxruntime, JaxMARL."""
+    try:
+        exec(block, names)
+    except (ImportError, gacrl.UserError) as error:
+        assert isinstance(error, ImportError) or "pip install" in str(error), block
+        return False
+    return True
+
+
+def runs(words: list[str], capsys: pytest.CaptureFixture[str]) -> bool:
+    """Run a command of a guide, unless it is for a machine with other things on it."""
+    if words[0] in ("pip", "make") or words[1].startswith("benchmarks/"):
+        return False
+    if words[0] == "python":
+        done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return True
+    assert words[0] == "gacrl"
+    if words[1] in LONG or any("NAME" in word for word in words):
+        return False
+    if "--env-steps" in words:
+        steps = words.index("--env-steps") + 1
+        words[steps] = str(min(int(words[steps]), 2000))
+    code, said = cli.main(words[1:]), capsys.readouterr().err
+    assert code == 0 or "pip install 'gacrl[" in said, (words, said)
+    return True
