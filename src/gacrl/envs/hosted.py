@@ -2,14 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
 from gacrl.types import Observation, PRNGKey
+
+Actions: TypeAlias = Int[np.ndarray, "C N"] | Float[np.ndarray, "C N A"]
+"""What the agents of C copies do."""
 
 
 class Copies(ABC):
@@ -26,7 +29,7 @@ class Copies(ABC):
         """
 
     @abstractmethod
-    def step(self, actions: Int[np.ndarray, "C N"], going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
+    def step(self, actions: Actions, going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
         """Step the copies and return what it brought, [C, …] in each of its arrays.
 
         Of copies that are not `going` the last outcome stands. Raises Faulty.

@@ -17,7 +17,7 @@ from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
-from gacrl.tasks.foreign.layout import Layout, Padded, lay_out
+from gacrl.tasks.foreign.layout import Layout, Padded, Reach, lay_out
 from gacrl.tasks.foreign.worlds import Scripted, World, Worlds
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
@@ -199,7 +199,15 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
 
     def unstack(self, actions: Array | np.ndarray) -> list[Any]:
         """Return the agents' actions as the environment takes them."""
-        return [self.layout.action(i, int(choice)) for i, choice in enumerate(np.asarray(actions))]
+        return [self.layout.action(i, chosen) for i, chosen in enumerate(np.asarray(actions).tolist())]
+
+    def idle(self) -> Float[np.ndarray, "N A"]:
+        """Return the actions nearest to 0."""
+        shares = np.zeros((self.num_agents, self.num_actions), np.float32)
+        for place, acts in zip(shares, self.layout.acts, strict=True):
+            if isinstance(acts, Reach):
+                place[: acts.count] = acts.idle()
+        return shares
 
 
 def _require_parallel(task: str, env: Any) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from gacrl.envs.environment import TimeStep
-from gacrl.envs.hosted import Copies
+from gacrl.envs.hosted import Actions, Copies
 from gacrl.errors import Faulty
 from gacrl.tasks.foreign.layout import Layout
 from gacrl.types import Observation
@@ -49,7 +49,7 @@ class World:
         self.terminated = self.truncated = False
         self._see(seen, infos, self.there)
 
-    def step(self, choices: Int[np.ndarray, " N"]) -> None:
+    def step(self, choices: Int[np.ndarray, " N"] | Float[np.ndarray, "N A"]) -> None:
         """Take a step. Raises Faulty."""
         acting = [(i, agent) for i, agent in enumerate(self.layout.agents) if self.there[i]]
         actions = {
@@ -184,7 +184,7 @@ class Worlds(Copies):
             self._worlds[copy].begin(None if seeds is None else seeds[k])
         return self._observation()
 
-    def step(self, actions: Int[np.ndarray, "C N"], going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
+    def step(self, actions: Actions, going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
         """Step those that are going."""
         for k, world in enumerate(self._worlds):
             if going is None or going[k]:
