@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,6 +56,14 @@ class Hosted(Environment):
     @abstractmethod
     def open(self, copies: int, seen: bool = False) -> Copies:
         """Make so many copies. seen: pictures of them will be asked for."""
+
+    @abstractmethod
+    def over(self, crew: Any) -> "Hosted":
+        """Return the same environment whose copies are opened in the processes of a crew, until it is closed."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of what all copies share."""
 
     def reset(self, key: PRNGKey, params: EnvParams = ()) -> tuple[EnvState, Observation]:
         """Return an observation of zeros."""

@@ -2,8 +2,8 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
@@ -17,8 +17,9 @@ from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
+from gacrl.tasks.foreign.crew import Crew
 from gacrl.tasks.foreign.layout import Layout, Padded, Reach, lay_out
-from gacrl.tasks.foreign.worlds import Scripted, World, Worlds
+from gacrl.tasks.foreign.worlds import Recipe, Scripted
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
 
@@ -145,6 +146,8 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
     layout: Layout
     max_cycles: int
     scripted: Scripted
+    crew: Crew | None = None
+    """The processes in which copies are opened; None: they are opened here."""
 
     @classmethod
     def of(cls, task: str, maker: _Maker, settings: Any, scripted: Scripted) -> "Zoo":
@@ -167,12 +170,18 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
 
     def open(self, copies: int, seen: bool = False) -> Copies:
         """Make so many environments."""
-        return Worlds(
-            [
-                World(self.task, self.maker.make(self.settings, seen), self.layout, self.max_cycles, self.scripted)
-                for _ in range(copies)
-            ]
-        )
+        make = partial(self.maker.make, self.settings)
+        recipe = Recipe(self.task, make, self.layout, self.max_cycles, dict(self.scripted))
+        return recipe.open(copies, seen) if self.crew is None else self.crew.open(recipe, copies, seen)
+
+    def over(self, crew: Crew) -> "Zoo":
+        """Return the same whose copies are opened by a crew."""
+        return replace(self, crew=crew)
+
+    def close(self) -> None:
+        """End the processes, where there are some."""
+        if self.crew is not None:
+            self.crew.close()
 
     def step(
         self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams = ()

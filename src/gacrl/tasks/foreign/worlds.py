@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,24 @@ class World:
                 f"{self.task} raised {type(error).__name__} in {what}, after {self.clock} steps of an episode"
                 f"{': ' if said else ''}{said}; mend the environment"
             ) from error
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How copies of an environment are made, here or in another process."""
+
+    task: str
+    make: Callable[[bool], Any]
+    """(whether pictures will be asked for) -> a new environment."""
+    layout: Layout
+    max_cycles: int
+    scripted: Scripted
+
+    def open(self, copies: int, seen: bool = False) -> "Worlds":
+        """Make so many. Raises ConfigError."""
+        return Worlds(
+            [World(self.task, self.make(seen), self.layout, self.max_cycles, self.scripted) for _ in range(copies)]
+        )
 
 
 class Worlds(Copies):
