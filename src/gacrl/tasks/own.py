@@ -28,7 +28,7 @@ from gacrl.tasks.foreign import jaxmarl, pettingzoo
 from gacrl.tasks.task import RETURN, Task
 from gacrl.types import Observation
 
-_SCHEMES = {pettingzoo.SCHEME: pettingzoo.by_module, jaxmarl.SCHEME: jaxmarl.by_name}
+_SCHEMES = {pettingzoo.SCHEME: pettingzoo.by_name, jaxmarl.SCHEME: jaxmarl.by_name}
 """Environments of other libraries, by how their names begin."""
 _SIZES = ("num_agents", "num_actions", "observation_size", "max_cycles")
 

@@ -276,6 +276,11 @@ def test_an_environment_that_does_not_fit_is_one_sentence(
             "pettingzoo:mpe2.simple_spred_v3",
             "No module named 'mpe2.simple_spred_v3'; install it, or name a module",
         ),
+        (
+            "pettingzoo:sisl/pursuit_v4",
+            "unknown parallel environment of PettingZoo 'sisl/pursuit_v4': did you mean",
+        ),
+        ("pettingzoo:classic/chess_v6", "the environment is turn-based (AEC)"),
         ("pettingzoo:json", "it has no `parallel_env`"),
     ],
 )

@@ -1,5 +1,6 @@
 """PettingZoo's parallel environments as tasks: by a function that makes one, or by the module that has one."""
 
+import contextlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gacrl.config.checks import unknown
 from gacrl.envs.environment import EnvParams, EnvState, TimeStep, as_floats, observe
 from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
@@ -54,22 +56,45 @@ def from_pettingzoo(
     return _task(name or maker.own_name(), maker, dict(scripted))
 
 
-def by_module(name: str) -> Own:
-    """Return the task that `pettingzoo:MODULE` names, as `--env` has it. Raises ConfigError."""
-    module_name = name.removeprefix(SCHEME)
+def by_name(name: str) -> Own:
+    """Return the task that `pettingzoo:MODULE` or `pettingzoo:ID` names, as `--env` has it. Raises ConfigError.
+
+    An ID is one of PettingZoo's registry, which has a slash in it: `sisl/pursuit_v5`.
+    """
+    named = name.removeprefix(SCHEME)
+    spec = _registered(name, named) if "/" in named else None
+    if spec is not None and callable(spec.entry_point):
+        task = _task(name, _Maker(spec.make, inspect.signature(spec.entry_point)), {})
+        return Own(task, task.settings())
+    module_name = named if spec is None else str(spec.entry_point).partition(":")[0]
     try:
         module = import_module(module_name)
     except ImportError as error:
         raise ConfigError(
             f"--env {name}: {error}; install it, or name a module that has `parallel_env`"
         ) from error
-    make_env = getattr(module, "parallel_env", None)
+    make_env = getattr(module, "parallel_env", None) if spec is None else spec.make
     if make_env is None:
         turns = hasattr(module, "env") or hasattr(module, "raw_env")
         raise ConfigError(f"--env {name}: {_turn_based('the module') if turns else 'it has no `parallel_env`'}")
     signature = inspect.signature(getattr(module, "raw_env", make_env))  # parallel_env itself takes **kwargs
     task = _task(name, _Maker(make_env, signature), {})
     return Own(task, task.settings(), digest=version_of(module_name))
+
+
+def _registered(name: str, named: str) -> Any:
+    """Look an environment up in PettingZoo's registry. Raises ConfigError."""
+    import pettingzoo
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
+    try:
+        return pettingzoo.spec("parallel", named)
+    except PettingZooRegistryError as error:
+        with contextlib.suppress(PettingZooRegistryError):
+            pettingzoo.spec("aec", named)
+            raise ConfigError(f"--env {name}: {_turn_based('the environment')}") from error
+        known = list(pettingzoo.parallel_registry)
+        raise ConfigError(unknown("parallel environment of PettingZoo", named, known)) from error
 
 
 def _turn_based(what: str) -> str:
