@@ -15,6 +15,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 import gacrl
 from gacrl import tasks
+from gacrl.adapters.pettingzoo import ParallelTask
 
 with warnings.catch_warnings():  # one of its tests imports an environment in a way that it warns of
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -38,6 +39,7 @@ def test_pettingzoos_own_tests_pass(task: str):
 def test_they_stand_in_pettingzoos_registry():
     env = pettingzoo.make("parallel", "gacrl/spread-v0", num_agents=4, max_cycles=7)
     assert (len(env.possible_agents), env.max_cycles, env.metadata["name"]) == (4, 7, "gacrl_spread_v0")
+    assert isinstance(env, ParallelTask)
     assert isinstance(pettingzoo.make("aec", "gacrl/reference"), pettingzoo.AECEnv)
 
 

@@ -278,7 +278,7 @@ def test_an_environment_that_does_not_fit_is_one_sentence(
         ),
         (
             "pettingzoo:sisl/pursuit_v4",
-            "unknown parallel environment of PettingZoo 'sisl/pursuit_v4': did you mean",
+            "unknown parallel environment 'sisl/pursuit_v4': did you mean",
         ),
         ("pettingzoo:classic/chess_v6", "the environment is turn-based (AEC)"),
         ("pettingzoo:json", "it has no `parallel_env`"),

@@ -94,7 +94,7 @@ def _registered(name: str, named: str) -> Any:
             pettingzoo.spec("aec", named)
             raise ConfigError(f"--env {name}: {_turn_based('the environment')}") from error
         known = list(pettingzoo.parallel_registry)
-        raise ConfigError(unknown("parallel environment of PettingZoo", named, known)) from error
+        raise ConfigError(f"--env {name}: {unknown('parallel environment', named, known)}") from error
 
 
 def _turn_based(what: str) -> str:
