@@ -12,7 +12,7 @@ import optax
 
 import gacrl
 from gacrl import Algorithm
-from gacrl.algorithms.ppo import log_policy
+from gacrl.algorithms.distributions import log_policy
 from gacrl.algorithms.shared import taken
 from gacrl.config.algorithms import ALGORITHMS, Kind, LearningConfig, NetworkConfig
 from gacrl.networks.agent import AgentNetwork, unroll

@@ -8,12 +8,14 @@ from typing import Any
 
 import jax
 import numpy as np
+import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils.conversions import parallel_to_aec
 
 import gacrl
 from gacrl import tasks
+from gacrl.adapters.pettingzoo import ParallelTask
 
 with warnings.catch_warnings():  # one of its tests imports an environment in a way that it warns of
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -32,6 +34,13 @@ def aec(**settings: Any) -> Any:
 def test_pettingzoos_own_tests_pass(task: str):
     parallel_api_test(gacrl.to_pettingzoo(task), num_cycles=60)
     parallel_seed_test(partial(gacrl.to_pettingzoo, task), num_cycles=20)
+
+
+def test_they_stand_in_pettingzoos_registry():
+    env = pettingzoo.make("parallel", "gacrl/spread-v0", num_agents=4, max_cycles=7)
+    assert (len(env.possible_agents), env.max_cycles, env.metadata["name"]) == (4, 7, "gacrl_spread_v0")
+    assert isinstance(env, ParallelTask)
+    assert isinstance(pettingzoo.make("aec", "gacrl/reference"), pettingzoo.AECEnv)
 
 
 def test_episodes_end_when_max_cycles_says():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import drawn_learner
 
-from gacrl.algorithms import exploration, ippo, ppo
+from gacrl.algorithms import distributions, exploration, ippo
 from gacrl.algorithms.exploration import EXPLORING, GREEDY, UNSETTLED, Exploration, Follower, Level
 from gacrl.algorithms.shared import taken
 from gacrl.config.algorithms import IppoConfig, LearningConfig, NetworkConfig, VdnConfig
@@ -206,11 +206,11 @@ def test_an_episode_is_settled_once(rule: Exploration):
 def test_the_mixture_by_hand():
     """(1 − ε) π + ε / 3 for the three actions that are available. At ε = 0.3: 0.7 π + 0.1."""
     log_pi = jnp.log(jnp.array([[0.5, 0.25, 0.0, 0.25], [0.125, 0.0, 0.75, 0.125]]))
-    mixed = np.exp(ppo.mixed(log_pi, jnp.array([0.3, 0.3])))
+    mixed = np.exp(distributions.mixed(log_pi, jnp.array([0.3, 0.3])))
     np.testing.assert_allclose(mixed, [[0.45, 0.275, 0, 0.275], [0.1875, 0, 0.625, 0.1875]], rtol=1e-6)
     # An ε for each environment, of two agents each: 0, which is π, ½, and 1, which is uniform.
     log_pi = jnp.broadcast_to(log_pi, (3, 2, 4))
-    mixed = np.exp(ppo.mixed(log_pi, jnp.array([[0.0], [0.5], [1.0]])))
+    mixed = np.exp(distributions.mixed(log_pi, jnp.array([[0.0], [0.5], [1.0]])))
     np.testing.assert_allclose(mixed[0], np.exp(log_pi[0]), rtol=1e-6)
     third = 1 / 3
     half = [[0.25 + third / 2, 0.125 + third / 2, 0, 0.125 + third / 2]]
@@ -223,14 +223,14 @@ def test_the_mixture_by_hand():
 @pytest.mark.parametrize("epsilon", [None, 0.0])
 def test_without_random_actions_the_policy_is_handed_through(epsilon: float | None):
     log_pi = jnp.log(jnp.array([[0.5, 0.5, 0.0]]))
-    assert ppo.mixed(log_pi, epsilon) is log_pi
+    assert distributions.mixed(log_pi, epsilon) is log_pi
 
 
 @pytest.mark.parametrize("epsilon", [0.3, jnp.float32(0.3)], ids=["number", "array"])
 def test_one_share_of_random_actions_is_that_of_all_agents(epsilon: Any):
     """As a rule hands it out for an environment."""
     log_pi = jnp.log(jnp.array([[0.5, 0.25, 0.0, 0.25], [0.125, 0.0, 0.75, 0.125]]))
-    mixed = np.exp(ppo.mixed(log_pi, epsilon))
+    mixed = np.exp(distributions.mixed(log_pi, epsilon))
     np.testing.assert_allclose(mixed, [[0.45, 0.275, 0, 0.275], [0.1875, 0, 0.625, 0.1875]], rtol=1e-6)
 
 
@@ -239,7 +239,7 @@ def test_the_mixture_has_a_gradient_where_actions_are_missing():
     mask = jnp.array([True, False, True, True])
 
     def log_first(logits: jax.Array) -> jax.Array:
-        mixture = ppo.mixed(ppo.log_policy(logits, mask)[None], jnp.array([0.3]))
+        mixture = distributions.mixed(distributions.log_policy(logits, mask)[None], jnp.array([0.3]))
         return taken(mixture, jnp.array([0]))[0]
 
     logits = jnp.log(jnp.array([0.5, 0.9, 0.25, 0.25]))

@@ -13,7 +13,8 @@ from conftest import drawn, drawn_learner
 from scipy import special, stats
 
 from gacrl import rollout
-from gacrl.algorithms import ippo, mappo, ppo
+from gacrl.algorithms import distributions, ippo, mappo, ppo
+from gacrl.algorithms.actions import choices
 from gacrl.algorithms.objectives import clipped_surrogate, follow_returns, huber, no_returns
 from gacrl.algorithms.shared import mean_real, share_reward
 from gacrl.config.algorithms import IppoConfig, MappoConfig, NetworkConfig
@@ -47,14 +48,18 @@ def test_huber_is_that_of_rlax_and_entropy_that_of_scipy():
     np.testing.assert_allclose(huber(jnp.array([1.0, -3.0]), 2.0), [0.5, 2 * 3 - 2])
     logits = jnp.asarray(np.random.default_rng(1).normal(size=(6, 5)), jnp.float32)
     everything = jnp.ones((6, 5), bool)
-    found = ppo.entropy(ppo.log_policy(logits, everything))
+    found = distributions.entropy(distributions.log_policy(logits, everything))
     np.testing.assert_allclose(found, stats.entropy(special.softmax(logits, -1), axis=-1), rtol=1e-5)
     # What is not available has probability 0, adds nothing and gets no gradient.
     mask = jnp.array([True, False, True])
-    log_probs = ppo.log_policy(jnp.array([0.0, 9.0, np.log(3.0)]), mask)
+    log_probs = distributions.log_policy(jnp.array([0.0, 9.0, np.log(3.0)]), mask)
     np.testing.assert_allclose(jnp.exp(log_probs), [0.25, 0, 0.75], rtol=1e-6)
-    np.testing.assert_allclose(ppo.entropy(log_probs), -(0.25 * np.log(0.25) + 0.75 * np.log(0.75)), rtol=1e-6)
-    slope = jax.grad(lambda logits: ppo.entropy(ppo.log_policy(logits, mask)))(jnp.array([0.0, 9.0, 1.0]))
+    np.testing.assert_allclose(
+        distributions.entropy(log_probs), -(0.25 * np.log(0.25) + 0.75 * np.log(0.75)), rtol=1e-6
+    )
+    slope = jax.grad(lambda logits: distributions.entropy(distributions.log_policy(logits, mask)))(
+        jnp.array([0.0, 9.0, 1.0])
+    )
     assert np.isfinite(slope).all() and slope[1] == 0 and slope[0] > 0
 
 
@@ -159,9 +164,10 @@ def test_the_loss_and_its_gradient_are_the_printed_ones():
         means = {name: values[real].mean() for name, values in parts.items()}
         return means["loss_policy"] + 0.7 * means["loss_critic"] - 0.03 * means["entropy"], means
 
-    slope = jax.jit(jax.value_and_grad(ppo.loss, has_aux=True), static_argnums=5)
+    slope = jax.jit(jax.value_and_grad(ppo.loss, has_aux=True), static_argnums=(5, 6))
     nothing = ppo.PpoMemory((), ())
-    (total, parts), gradient = slope(network, sample, nothing, HYPER, jnp.float32(0.03), 1.5)
+    family = distributions.categorical(choices(THREE))
+    (total, parts), gradient = slope(network, sample, nothing, HYPER, jnp.float32(0.03), 1.5, family)
     expected, means = printed(logits, value)
     np.testing.assert_allclose(total, expected, rtol=1e-5)
     for name, mean in means.items():
@@ -294,8 +300,6 @@ def test_targets_minibatches_and_step_sizes(reward: Any, seen: list[Seen]):
 
 # The policy that acted is the one that is learned from.
 
-SPREAD = Spread(3, 2, max_cycles=3)
-
 
 @dataclass(frozen=True)
 class Slots(Spread):
@@ -312,6 +316,7 @@ class Case(NamedTuple):
     augment: bool = False
     exploration: str = "none"
     lives: bool = False
+    continuous: bool = False
 
 
 CASES = {
@@ -325,6 +330,7 @@ CASES = {
     "commnet, recurrent, lives end inside the episode": Case("commnet", recurrent=True, lives=True),
     "dial, recurrent, lives end inside the episode": Case("dial", recurrent=True, lives=True),
     "discrete symbols, lives end inside the episode": Case("discrete", lives=True),
+    "discrete symbols, continuous actions": Case("discrete", continuous=True),
 }
 
 
@@ -336,7 +342,8 @@ def test_the_first_ratio_is_one(name: str, monkeypatch: pytest.MonkeyPatch):
     follows a life's end.
     """
     case = CASES[name]
-    augment, env = case.augment, Slots(3, 2, max_cycles=3) if case.lives else SPREAD
+    augment, kind = case.augment, Slots if case.lives else Spread
+    env = kind(3, 2, max_cycles=3, continuous_actions=case.continuous)
     config = MappoConfig(
         network=NetworkConfig(width=8, depth=1, recurrent=case.recurrent, communication=case.communication),
         augment=augment,

@@ -1,4 +1,7 @@
-"""Our tasks as PettingZoo's parallel environments, for programs that know nothing of JAX."""
+"""Our tasks as PettingZoo's parallel environments, for programs that know nothing of JAX.
+
+Who imports this module has them in PettingZoo's registry as well: `pettingzoo.make("parallel", "gacrl/spread-v0")`.
+"""
 
 import secrets
 from collections.abc import Mapping
@@ -10,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box, Discrete, Space
 from jaxtyping import Array, Float, Int, Key, UInt8
-from pettingzoo import ParallelEnv
+from pettingzoo import ParallelEnv, register
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from gacrl import render, tasks
 from gacrl.config import files as configuration
@@ -204,6 +208,15 @@ class ParallelTask(ParallelEnv[str, np.ndarray, Any]):
         self._window.blit(pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
         pygame.event.pump()
         pygame.display.flip()
+
+
+def _turn_based(task: str, **settings: Any) -> Any:
+    return parallel_to_aec(to_pettingzoo(task, **settings))
+
+
+for _name in (name for name in tasks.names() if tasks.brought(name) is None):
+    register("parallel", f"gacrl/{_name}-v0", entry_point=partial(to_pettingzoo, _name))
+    register("aec", f"gacrl/{_name}-v0", entry_point=partial(_turn_based, _name))
 
 
 class _Reel:

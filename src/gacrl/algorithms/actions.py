@@ -12,28 +12,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from gacrl.config.checks import require
 from gacrl.envs.environment import Environment
 
 STRENGTHS = (1.0, 0.5, 0.25)
 
 
 class ActionSet(NamedTuple):
-    """Choices by index."""
+    """Choices by index; or what is drawn where actions are continuous, numbers [N A]."""
 
     size: int
-    act: Callable[[Int[Array, " N"]], Array]
+    act: Callable[[Array], Array]
     """What the task takes: [N] indices, or [N A] pushes."""
-    turn: Callable[[Int[Array, "*b"], Int[Array, ""]], Int[Array, "*b"]]
+    turn: Callable[[Array, Int[Array, ""]], Array]
     """The choices that do in a turned world what these do here."""
     mask: Callable[[Bool[Array, "*b N A"]], Bool[Array, "*b N K"]]
     """Which choices are available, from the task's mask of actions."""
 
 
 def choices(env: Environment) -> ActionSet:
-    """What the agents of this task choose among."""
+    """What the agents of this task choose among. Raises ConfigError for continuous actions that are no pushes."""
     if not env.continuous_actions:
         return ActionSet(env.num_actions, lambda choice: choice, env.turn_action, lambda mask: mask)
 
+    require(
+        env.pushes,
+        "the task's actions are continuous, and this algorithm chooses among actions: take the preset ippo, mappo or "
+        "commnet, or offer a choice (Discrete) in a wrapper of the environment",
+    )
     table = np.concatenate([np.eye(env.num_actions)[:1], *[s * np.eye(env.num_actions)[1:] for s in STRENGTHS]])
     with jax.ensure_compile_time_eval():  # also where a program that uses it is being traced
         turned = [

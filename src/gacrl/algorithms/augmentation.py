@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import actions
+from gacrl.algorithms.actions import ActionSet
 from gacrl.config.algorithms import LearningConfig
 from gacrl.config.checks import require
 from gacrl.envs.environment import Environment
@@ -15,14 +16,13 @@ from gacrl.networks.agent import AgentNetwork, AgentOutput
 from gacrl.types import Memory, Observation, PRNGKey, Transition
 
 
-def turn_experience(env: Environment, steps: Transition, key: PRNGKey) -> Transition:
+def turn_experience(env: Environment, choices: ActionSet, steps: Transition, key: PRNGKey) -> Transition:
     """Each environment's steps [T, E, …] in a world turned by a random symmetry; rewards stay as they are.
 
-    The decisions' actions are indices of `actions.choices`. A task without symmetries gives its steps back.
+    The decisions' actions are what was drawn of the choices. A task without symmetries gives its steps back.
     """
     if env.num_symmetries == 1:
         return steps
-    choices = actions.choices(env)
     symmetries = jax.random.randint(key, (steps.first.shape[1],), 0, env.num_symmetries)
 
     def turn(steps: Transition, symmetry: Int[Array, ""]) -> Transition:

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gacrl.algorithms.actions import ActionSet, choices
+from gacrl.algorithms.actions import ActionSet
 from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
+from gacrl.algorithms.distributions import Distribution, distribution, explores
 from gacrl.algorithms.exploration import Exploration, Level, progress_between
 from gacrl.algorithms.objectives import (
     ValueNorm,
@@ -26,8 +27,9 @@ from gacrl.algorithms.objectives import (
     no_returns,
 )
 from gacrl.algorithms.returns import generalised_advantages, n_step_returns, next_values
-from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, sum_over_devices, taken
+from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, sum_over_devices
 from gacrl.config.algorithms import NetworkConfig, PpoConfig
+from gacrl.config.checks import require
 from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
@@ -81,7 +83,7 @@ class Sample(NamedTuple):
     observation: Observation
     first: Bool[Array, "L B ..."]
     """Before which steps memories begin anew; [L, B, N] where lives end inside episodes."""
-    action: Int[Array, "L B N"]
+    action: Int[Array, "L B N"] | Float[Array, "L B N A"]
     key: Key[Array, "L B"]
     """What the agents drew with: the loss draws the same again, so that the first ratio is 1."""
     log_prob: Float[Array, "L B N"]
@@ -98,26 +100,34 @@ class Setup:
 
     config: PpoConfig
     env: Environment
-    actions: ActionSet
+    distribution: Distribution
     settings: NetworkConfig
     view: View
     explorer: Exploration
     adam: optax.GradientTransformation
     steps_per_update: int
 
+    @property
+    def actions(self) -> ActionSet:
+        return self.distribution.actions
+
 
 def make(
     config: PpoConfig, env: Environment, training: TrainingConfig, progress: str | None, view: View
 ) -> Algorithm:
-    """PPO for this task's shapes, with the critic's view. progress: the measure that exploration may follow."""
-    actions = choices(env)
+    """PPO for this task's shapes, with the critic's view. progress: the measure that exploration may follow.
+
+    Raises ConfigError for settings that continuous actions do not go with.
+    """
+    family = distribution(env)
+    _require_fit(config, env)
     explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
     per_update = training.num_envs * training.num_steps
     p = Setup(
         config=config,
         env=env,
-        actions=actions,
-        settings=matched(env, config.network, actions.size),
+        distribution=family,
+        settings=matched(env, config.network, family.actions.size),
         view=view,
         explorer=explore(config, training.env_steps, progress),
         adam=clipped_adam(config.max_grad_norm, eps=1e-5),
@@ -141,11 +151,25 @@ def make(
             planned_updates=max(1.0, training.env_steps / per_update),
         ),
         acting=lambda learner: learner._replace(optimizer=()),
-        network=None if config.symmetric_play else lambda learner: learner.network.actor,
+        network=None if config.symmetric_play or env.continuous_actions else lambda learner: learner.network.actor,
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(optimizer=(), updates=(), hyper=(), exploration=()),
         splits_envs=True,
     )
+
+
+def _require_fit(config: PpoConfig, env: Environment) -> None:
+    """Raises ConfigError for what only a choice among actions has."""
+    if env.continuous_actions:
+        require(
+            config.exploration == "none",
+            f"algorithm.exploration {config.exploration} makes actions random, and continuous ones are drawn already: "
+            "leave it at none",
+        )
+        require(
+            not config.symmetric_play,
+            "algorithm.symmetric_play takes the mean of choices, and these actions are continuous: leave it off",
+        )
 
 
 def networks(p: Setup, key: PRNGKey) -> Network:
@@ -190,34 +214,6 @@ def level_of(p: Setup, learner: LearnerState) -> Level:
     return p.explorer.level(learner.exploration, env_steps)
 
 
-def log_policy(logits: Float[Array, "*b A"], action_mask: Bool[Array, "*b A"]) -> Float[Array, "*b A"]:
-    """log π; −∞ for actions that are not available."""
-    return jax.nn.log_softmax(jnp.where(action_mask, logits, -jnp.inf))
-
-
-def explores(epsilon: Float[Array, "..."] | float) -> bool:
-    """Whether there may be random actions: False for a plain 0, which costs nothing."""
-    return not (isinstance(epsilon, float) and epsilon == 0.0)
-
-
-def mixed(log_probs: Float[Array, "*b A"], epsilon: Float[Array, "*#b"] | float | None) -> Float[Array, "*b A"]:
-    """What is acted by: (1 − ε) π + ε · uniform over the available actions; π itself for no ε."""
-    if epsilon is None or not explores(epsilon):
-        return log_probs
-    available = log_probs > -jnp.inf
-    uniform = available / available.sum(-1, keepdims=True)
-    share = jnp.asarray(epsilon)
-    share = share[..., None] if share.ndim else share
-    probs = jnp.where(available, jnp.exp(jnp.where(available, log_probs, 0.0)), 1.0)  # finite gradients everywhere
-    return jnp.where(available, jnp.log((1.0 - share) * probs + share * uniform), -jnp.inf)
-
-
-def entropy(log_probs: Float[Array, "*b A"]) -> Float[Array, "*b"]:
-    """Of categorical distributions, in nats; actions with probability 0 count nothing."""
-    probs = jnp.exp(log_probs)
-    return -(probs * jnp.where(probs > 0, log_probs, 0.0)).sum(-1)
-
-
 def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
     """Sampled from π, among random actions where the rule of exploration has some; or greedy."""
     level = level_of(p, learner)
@@ -231,19 +227,19 @@ def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
         else:
             symmetric = p.config.symmetric_play
             output, actor_memory = play(p.env, symmetric, actor, observation, actor_memory, temperature)
-        log_probs = log_policy(output.head, p.actions.mask(observation.action_mask))
+        pi = p.distribution.of(output.head, p.actions.mask(observation.action_mask))
         if explore:
             settles = jax.tree.leaves(mode)  # where nothing does, nothing is drawn for it
             mode_key = jax.random.fold_in(choice_key, 1) if settles else choice_key
             mode, epsilon = p.explorer.begin(mode, mode_key, level.epsilon)
-            log_probs = mixed(log_probs, epsilon)
+            pi = p.distribution.mixed(pi, epsilon)
             extras = {"epsilon": jnp.asarray(epsilon)} if explores(epsilon) else {}
-        choice = jax.random.categorical(choice_key, log_probs) if explore else log_probs.argmax(-1)
+        choice = p.distribution.sample(pi, choice_key) if explore else p.distribution.mode(pi)
         value, critic_memory = learner.network.critic(observation, critic_memory)
         extras |= {
             "value": learner.norm.denormalise(value),
             "choice": choice,
-            "log_prob": taken(log_probs, choice),
+            "log_prob": p.distribution.log_prob(pi, choice),
             "key": talk_key,
             "mode": mode,
         }
@@ -296,6 +292,7 @@ def loss(
     hyper: Hyper,
     ent_coef: Float[Array, ""],
     huber_delta: float,
+    family: Distribution,
     count: Int[Array, ""] | None = None,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, ""], Metrics]:
@@ -309,15 +306,15 @@ def loss(
         own = {} if acted.message_loss is None else {"loss_messages": acted.message_loss}
         return acted.head, network.critic.unroll(observation, first, memory.critic)[0], own
 
-    logits, value, own = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
-    log_probs = log_policy(logits, sample.observation.action_mask)
+    head, value, own = jax.vmap(one, (1, 1, 1, 0), 1)(sample.observation, sample.first, sample.key, memory)
+    pi = family.of(head, sample.observation.action_mask)
     shares = None if sample.epsilon is None else sample.epsilon[..., None]  # of all agents of an environment
-    log_prob = taken(mixed(log_probs, shares), sample.action)
+    log_prob = family.log_prob(family.mixed(pi, shares), sample.action)
     real = sample.observation.agent_mask
     parts = {
         "loss_policy": clipped_surrogate(log_prob, sample.log_prob, sample.advantage, hyper.clip_eps),
         "loss_critic": huber(value - sample.target, huber_delta),
-        "entropy": entropy(log_probs),
+        "entropy": family.entropy(pi),
         "ratio_clipped": (jnp.abs(jnp.exp(log_prob - sample.log_prob) - 1) > hyper.clip_eps) * 1.0,
         "kl": sample.log_prob - log_prob,
         **own,
@@ -340,7 +337,8 @@ def gradients_on(p: Setup, whole: tuple[Any, ...], rows: Int[Array, " rows"]) ->
     part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
     remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
     gradient = jax.grad(loss, has_aux=True)
-    return gradient(network, part, remembered, hyper, ent_coef, p.config.huber_delta, count, temperature)
+    coefficients = hyper, ent_coef, p.config.huber_delta
+    return gradient(network, part, remembered, *coefficients, p.distribution, count, temperature)
 
 
 def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
@@ -351,7 +349,7 @@ def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> t
     advantage, returns = targets(p, learner, steps, memory)
     if p.config.augment:
         # Advantages, returns and the probability of the choice do not turn; what is remembered cannot.
-        steps = turn_experience(p.env, steps, turn_key)
+        steps = turn_experience(p.env, p.actions, steps, turn_key)
         memory = jax.tree.map(jnp.zeros_like, memory)
     real = steps.observation.agent_mask
     norm = follow_returns(learner.norm, returns, real) if p.config.value_norm else learner.norm
@@ -399,7 +397,7 @@ def sample_of(steps: Transition, advantage: Float[Array, "T E N"], target: Float
     return Sample(
         observation=steps.observation,
         first=first,
-        action=steps.decision.action,  # pyright: ignore[reportArgumentType] they are indices now
+        action=steps.decision.action,  # what was drawn, by now
         key=extras["key"],
         log_prob=extras["log_prob"],
         advantage=advantage,

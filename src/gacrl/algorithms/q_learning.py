@@ -482,7 +482,7 @@ def gradient_step(
     sampled = replay.items.at[rows, envs].get(mode="promise_in_bounds")
     batch = jax.vmap(jax.vmap(ring.packing(partial(example, q))[1]))(sampled)
     if q.config.augment:
-        batch = batch._replace(transition=turn_experience(q.env, batch.transition, turn_key))
+        batch = batch._replace(transition=turn_experience(q.env, q.actions, batch.transition, turn_key))
     keys = jax.random.split(noise_key, batch_size)
     gradient = jax.grad(partial(loss, q), has_aux=True)
     gradients, metrics = gradient(learner.network, learner, standing.rewards, batch, keys)

@@ -118,13 +118,15 @@ def dumps(config: RunConfig) -> str:
 
 
 def fingerprint(settings: RunConfig | Mapping[str, Any]) -> str:
-    """A hash of every setting but the run's length, which may be extended: what a checkpoint belongs to.
+    """A hash of every setting but the run's length, which may be extended, and the processes that its environments are
+    spread over: what a checkpoint belongs to.
 
     Of plain data: of the settings that stand in it, whatever further ones there are by now, so that a run made before
     a setting was added can still go on.
     """
     plain = to_dict(settings) if isinstance(settings, RunConfig) else settings
-    data = {**plain, "training": {k: v for k, v in plain.get("training", {}).items() if k != "env_steps"}}
+    free = ("env_steps", "env_processes")
+    data = {**plain, "training": {k: v for k, v in plain.get("training", {}).items() if k not in free}}
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 

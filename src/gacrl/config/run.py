@@ -5,7 +5,7 @@ from typing import Any
 
 from gacrl import tasks
 from gacrl.config.algorithms import AlgorithmConfig, GacrlConfig
-from gacrl.config.checks import between, take_types
+from gacrl.config.checks import between, require, take_types
 from gacrl.tasks.spread.settings import SpreadSettings
 
 
@@ -37,6 +37,9 @@ class TrainingConfig:
     """Environments side by side."""
     num_steps: int = 1
     """Steps of each environment between two updates."""
+    env_processes: int = 1
+    """Processes over which the environments of a seed are spread, where they live in Python (PettingZoo). Their number
+    changes no result."""
     intervention: str = ""
     """What happens to messages on their way, in training and in its evaluations: silence [AGENT …], swap AGENT AGENT,
     scramble, drop PROBABILITY, delay STEPS or noise PROBABILITY; nothing by default."""
@@ -44,7 +47,12 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         take_types("training", self)
         between("training", self, 1, 1e12, "env_steps")
-        between("training", self, 1, 1_000_000, "num_envs", "num_steps")
+        between("training", self, 1, 1_000_000, "num_envs", "num_steps", "env_processes")
+        require(
+            self.env_processes <= self.num_envs,
+            f"training.env_processes is {self.env_processes}, and there is no more than training.num_envs "
+            f"{self.num_envs} to spread over them: raise the latter",
+        )
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,9 @@ class Environment(ABC):
     max_cycles: int
     """Steps until the time limit."""
     continuous_actions: bool = False
-    """Actions are [N, A] numbers in [0, 1] instead of [N] indices."""
+    """Actions are [N, A] numbers in [0, 1] instead of [N] indices; `Observation.action_mask` says which ones count."""
+    pushes: ClassVar[bool] = False
+    """Continuous actions are MPE2's: no push, then a push in each direction, so that some can be chosen among."""
     num_symmetries: int = 1
     """Rotations and reflections under which the task is the same; 0 is the identity."""
     shortest_truncated: int = 1
@@ -139,6 +141,10 @@ class Environment(ABC):
     def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
         """The action that does in the turned world what this one does here."""
         return action
+
+    def idle(self) -> Float[np.ndarray, "N A"]:
+        """Return continuous actions that do nothing: by default pushes of 0."""
+        return np.zeros((self.num_agents, self.num_actions), np.float32)
 
     def step_many(
         self,

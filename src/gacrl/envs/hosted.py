@@ -2,14 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from gacrl.envs.environment import Environment, EnvParams, EnvState, TimeStep
 from gacrl.types import Observation, PRNGKey
+
+Actions: TypeAlias = Int[np.ndarray, "C N"] | Float[np.ndarray, "C N A"]
+"""What the agents of C copies do."""
 
 
 class Copies(ABC):
@@ -26,7 +29,7 @@ class Copies(ABC):
         """
 
     @abstractmethod
-    def step(self, actions: Int[np.ndarray, "C N"], going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
+    def step(self, actions: Actions, going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
         """Step the copies and return what it brought, [C, …] in each of its arrays.
 
         Of copies that are not `going` the last outcome stands. Raises Faulty.
@@ -53,6 +56,14 @@ class Hosted(Environment):
     @abstractmethod
     def open(self, copies: int, seen: bool = False) -> Copies:
         """Make so many copies. seen: pictures of them will be asked for."""
+
+    @abstractmethod
+    def over(self, crew: Any) -> "Hosted":
+        """Return the same environment whose copies are opened in the processes of a crew, until it is closed."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of what all copies share."""
 
     def reset(self, key: PRNGKey, params: EnvParams = ()) -> tuple[EnvState, Observation]:
         """Return an observation of zeros."""

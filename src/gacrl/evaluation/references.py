@@ -39,7 +39,7 @@ def noop(env: Environment) -> Actor:
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
-            return Decision(jnp.zeros((env.num_agents, env.num_actions))), memory
+            return Decision(jnp.asarray(env.idle())), memory
         return Decision(observation.action_mask.argmax(-1)), memory
 
     return Actor(policy, ())

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from gacrl import tasks
 from gacrl.algorithms.actions import choices
+from gacrl.algorithms.distributions import distribution
 from gacrl.config import files as configuration
+from gacrl.config.algorithms import PpoConfig
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.statistics import (
@@ -226,7 +228,8 @@ def _talking(config: RunConfig, seeds: int, env_steps: int) -> RunConfig:
 
 def _num_parameters(config: RunConfig) -> int:
     env = tasks.find(config.task).make(config.env)
-    actions = choices(env).size
+    draws = isinstance(config.algorithm, PpoConfig)
+    actions = (distribution(env).actions if draws else choices(env)).size
     network = matched(env, config.algorithm.network, actions)  # pyright: ignore[reportAttributeAccessIssue] checked
     return acting_parameters(env, network, actions)
 

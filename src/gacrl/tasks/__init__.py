@@ -17,6 +17,8 @@ from gacrl.errors import ConfigError
 from gacrl.tasks.task import Task
 
 DEFAULT = "spread"
+OWN_FILE = "gacrl_own_"
+"""The names of modules made of users' files begin so."""
 
 _OURS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
     {

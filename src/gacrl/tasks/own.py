@@ -28,7 +28,7 @@ from gacrl.tasks.foreign import jaxmarl, pettingzoo
 from gacrl.tasks.task import RETURN, Task
 from gacrl.types import Observation
 
-_SCHEMES = {pettingzoo.SCHEME: pettingzoo.by_module, jaxmarl.SCHEME: jaxmarl.by_name}
+_SCHEMES = {pettingzoo.SCHEME: pettingzoo.by_name, jaxmarl.SCHEME: jaxmarl.by_name}
 """Environments of other libraries, by how their names begin."""
 _SIZES = ("num_agents", "num_actions", "observation_size", "max_cycles")
 
@@ -94,7 +94,7 @@ def run_file(source: Path) -> Any:
         source.read_bytes()
     except OSError as error:
         raise ConfigError(f"cannot read {source}: {reason(error)}") from error
-    name = f"gacrl_own_{hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]}"
+    name = f"{tasks.OWN_FILE}{hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]}"
     spec = importlib.util.spec_from_file_location(name, source.absolute())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -12,8 +12,12 @@ from gacrl.algorithms import build as build_algorithm
 from gacrl.algorithms.contract import Algorithm
 from gacrl.config.checks import require
 from gacrl.config.run import RunConfig
+from gacrl.envs.environment import Environment
+from gacrl.envs.hosted import Hosted
+from gacrl.errors import ConfigError
 from gacrl.evaluation.references import look_of
 from gacrl.messages import interventions
+from gacrl.tasks.foreign.crew import Crew
 from gacrl.tasks.task import Task
 from gacrl.training import curriculum, footprint
 from gacrl.training.curriculum import constant
@@ -56,9 +60,13 @@ def make_trainer(
     """
     task = tasks.find(config.task)
     env, algorithm = task.make(config.env), make_algorithm(config)
+    over = config.training.env_processes if learns else 1
     params = task.numbers(config.env, env, getattr(config.algorithm, "gamma", 1.0))
     evaluated = evaluated_settings(config)
     evaluation_env = task.make(evaluated)
+    if over > 1:
+        crew = Crew(over)
+        env, evaluation_env = (_over(crew, one, task) for one in (env, evaluation_env))
     kind = HostTrainer if env.hosted else Trainer
     return kind(
         algorithm=algorithm,
@@ -77,6 +85,16 @@ def make_trainer(
         look=look_of(task, evaluated),
         intervention=interventions.parse(config.training.intervention) if intervention is None else intervention,
     )
+
+
+def _over(crew: Crew, env: Environment, task: Task) -> Hosted:
+    """The same environment, over processes. Raises ConfigError for one that is compiled."""
+    if not isinstance(env, Hosted):
+        raise ConfigError(
+            f"training.env_processes {crew.size} is for environments that live in Python, and {task.name} is compiled: "
+            "leave it at 1"
+        )
+    return env.over(crew)
 
 
 def make_algorithm(config: RunConfig) -> Algorithm:

@@ -118,6 +118,12 @@ class HostTrainer(AbstractTrainer):
         stacked = jax.tree.map(lambda *rows: np.stack(rows), *after)
         return Played(steps, stacked, stage.carry(carry), stage.left)
 
+    def close(self) -> None:
+        """End the processes of the environments, where they have some."""
+        for env in (self.env, self.evaluation_env):
+            assert isinstance(env, Hosted)
+            env.close()
+
     def _decided(
         self, learner: Learner, carry: Carry, left: Left, key: PRNGKey, step: Int[Array, ""]
     ) -> tuple[Carry, Decision]:

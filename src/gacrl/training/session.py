@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,8 @@ from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import evaluate_scripted
 from gacrl.evaluation.summary import normalised, over_seeds
 from gacrl.training import checkpoint
-from gacrl.training.ahead import Ahead, closing, prepare
+from gacrl.training.ahead import Ahead, prepare
+from gacrl.training.ahead import closing as closing_programs
 from gacrl.training.build import (
     evaluated_settings,
     learner_shapes,
@@ -79,7 +80,7 @@ def start(
     begun = None if parent is None else begin_with(trainer, config, parent)
     name = None if parent is None else parent.name
     folder = RunFolder.create(out, config, name) if leads() else RunFolder(out or Path("runs"))
-    with folder.locked() if leads() else nullcontext(), Ahead() as ahead:
+    with folder.locked() if leads() else nullcontext(), Ahead() as ahead, closing(trainer):
         watcher.planned(folder, config, planned)
         return _run(ahead, folder, config, trainer, None, watcher, configuration.fingerprint(config), begun)
 
@@ -113,7 +114,7 @@ def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | N
     watcher = watcher or Watcher()
     extend = None if extend is None else whole(extend, "extend", 1)
     folder = RunFolder.open(path)
-    with folder.locked() if leads() else nullcontext(), Ahead() as ahead:
+    with folder.locked() if leads() else nullcontext(), Ahead() as ahead, ExitStack() as opened:
         folder.require_room()
         config = folder.config()
         folder.warn_of_changed_task(watcher.warn)
@@ -123,7 +124,7 @@ def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | N
         if extend is not None:
             steps = config.training.env_steps + extend
             config = replace(config, training=replace(config.training, env_steps=steps))
-        trainer = make_trainer(config)
+        trainer = opened.enter_context(closing(make_trainer(config)))
         planned = plan(trainer, config)
         if leads():
             checkpoint.set_aside_damaged(folder.checkpoints)
@@ -261,7 +262,7 @@ class _Ending(NamedTuple):
 def _prepare_ending(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig) -> _Ending:
     """Compile what closes a run, and play the policies that learn nothing."""
     if isinstance(trainer, Trainer):
-        *_, program = [ahead.compiled(lower) for lower in closing(trainer, config)]
+        *_, program = [ahead.compiled(lower) for lower in closing_programs(trainer, config)]
         record = partial(_record, program)
     else:
         record = partial(_record_on_host, trainer)

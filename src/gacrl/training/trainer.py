@@ -205,6 +205,9 @@ class AbstractTrainer(ABC):
     def evaluate(self, learners: Learner, explore: bool, stream: Stream, num_episodes: int) -> dict[str, Any]:
         """The metrics of K fixed episodes of each seed's learner, [S, K], in the evaluation's task."""
 
+    def close(self) -> None:  # noqa: B027 nothing is open where environments are compiled
+        """Let go of what is open."""
+
     def learn(
         self,
         state: TrainState,

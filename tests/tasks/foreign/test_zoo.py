@@ -11,6 +11,7 @@ import gacrl
 from gacrl.envs.hosted import Copies
 from gacrl.errors import Faulty
 from gacrl.tasks import own
+from gacrl.tasks.foreign.layout import lay_out
 
 SEEN = {
     "guard_0": Box(-1, 1, (2, 2)),
@@ -116,6 +117,18 @@ def test_agents_are_padded_masked_and_told_apart_and_may_die():
     np.testing.assert_array_equal([step.info["reward_raw"][0] for step in steps], [2, 3, 3.5, 4.5, 5, 6])
     assert [(step.terminated[0], step.truncated[0]) for step in steps] == [(False, False)] * 5 + [(False, True)]
     assert steps[0].observation.features is not steps[1].observation.features, "what is handed out stays"
+
+
+def test_boxes_of_two_sizes_are_shares_between_their_bounds():
+    boxes = {"arm": Box(np.float32([[-1], [2]]), np.float32([[3], [4]])), "leg": Box(1, 5, (1,), np.float64)}
+    layout = lay_out("robot", list(boxes), dict.fromkeys(boxes, Box(0, 1, (3,))), boxes)
+    assert layout.continuous and layout.mask.tolist() == [[True, True], [True, False]]
+    arm, leg = layout.action(0, [0.25, 1.0]), layout.action(1, [0.5, 0.9])
+    np.testing.assert_array_equal(arm, np.array([[0.0], [4.0]], np.float32))
+    assert arm.dtype == np.float32 and leg.dtype == np.float64 and leg.tolist() == [3.0]
+    assert all(boxes[name].contains(action) for name, action in (("arm", arm), ("leg", leg)))
+    # The numbers nearest to 0: 0 and 2 of the arm, 1 of the leg.
+    assert [acts.idle().tolist() for acts in layout.acts] == [[0.25, 0.0], [0.0]]
 
 
 def test_an_episode_ends_with_the_last_of_those_who_learn():
@@ -235,7 +248,9 @@ def turn_based() -> Any:
         ),
         (shows(Dict({"a": SEEN["crowd"]})), {}, "thief_0 of town sees a Dict, and gacrl reads vectors (Box)"),
         (shows(Box(0, 255, (8, 8, 3), np.uint8)), {}, "thief_0 of town sees an image of the shape [8, 8, 3]"),
-        (shows(SEEN["crowd"], Box(-1, 1, (2,))), {}, "thief_0 of town acts by a Box: gacrl's agents choose"),
+        (shows(SEEN["crowd"], Box(-1, 1, (2,))), {}, "thief_0 of town acts by a Box and guard_0 by a Discrete"),
+        (shows(SEEN["crowd"], Box(-np.inf, 1, (2,))), {}, "thief_0 of town acts by a Box without bounds"),
+        (shows(SEEN["crowd"], Dict({"a": DOES["crowd"]})), {}, "thief_0 of town acts by a Dict: gacrl's agents"),
         (shows(SEEN["crowd"], MultiBinary(7)), {}, "has 128 actions, 2 × 2 × 2 × 2 × 2 × 2 × 2, and at most 64"),
         (endless, {}, "town does not say how long an episode is: give max_cycles"),
         (Town, {"max_cycles": 0}, "max_cycles of town must be a whole number above 0, not 0"),
@@ -261,6 +276,11 @@ def test_an_environment_that_does_not_fit_is_one_sentence(
             "pettingzoo:mpe2.simple_spred_v3",
             "No module named 'mpe2.simple_spred_v3'; install it, or name a module",
         ),
+        (
+            "pettingzoo:sisl/pursuit_v4",
+            "unknown parallel environment 'sisl/pursuit_v4': did you mean",
+        ),
+        ("pettingzoo:classic/chess_v6", "the environment is turn-based (AEC)"),
         ("pettingzoo:json", "it has no `parallel_env`"),
     ],
 )

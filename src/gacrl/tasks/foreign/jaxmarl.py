@@ -16,7 +16,7 @@ from gacrl.envs.environment import EnvParams, EnvState, TimeStep, observe
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
-from gacrl.tasks.foreign.layout import Layout, Padded, lay_out
+from gacrl.tasks.foreign.layout import Choice, Layout, Padded, lay_out
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
 
@@ -63,8 +63,10 @@ def _task_of(name: str, env: Any, max_steps: int | None) -> "JaxmarlTask":
         )
     seen = {agent: _space_of(shown[agent]) for agent in agents}
     layout = lay_out(name, agents, seen, {agent: env.action_space(agent) for agent in agents})
-    if not all(layout.plain):
-        raise ConfigError(f"{name} has actions of several parts: gacrl takes those of JaxMARL that are Discrete")
+    if not all(isinstance(acts, Choice) and acts.plain for acts in layout.acts):
+        raise ConfigError(
+            f"{name} has continuous actions or several parts: gacrl takes those of JaxMARL that are Discrete"
+        )
     steps = getattr(env, "max_steps", None) if max_steps is None else max_steps
     if not isinstance(steps, int | np.integer) or steps < 1:
         raise ConfigError(f"{name} does not say how long an episode is: give --env.max-steps 100")

@@ -1,5 +1,6 @@
 """How agents that see and can do different things fit into arrays: padded, masked, and told apart by their role."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,18 +18,67 @@ MOST_CHOICES = 64
 
 
 @dataclass(frozen=True)
+class Choice:
+    """An action that is one of so many: Discrete, or several numbers taken apart."""
+
+    sizes: tuple[int, ...]
+    """Of its parts."""
+    starts: tuple[int, ...]
+    """The smallest number of each part."""
+    plain: bool
+    """It is a single number."""
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return math.prod(self.sizes)
+
+    def taken(self, choice: int) -> Any:
+        """Return what a choice is there: a number, or an array of several."""
+        if self.plain:
+            return choice + self.starts[0]
+        return np.array(np.unravel_index(choice, self.sizes), np.int64) + np.array(self.starts)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """An action of numbers between bounds: Box."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    shape: tuple[int, ...]
+    dtype: str
+
+    @property
+    def count(self) -> int:
+        """How many numbers it has."""
+        return len(self.low)
+
+    @cached_property
+    def _bounds(self) -> Float[np.ndarray, "2 A"]:
+        return np.array([self.low, self.high])
+
+    def taken(self, shares: Sequence[float]) -> np.ndarray:
+        """Return the numbers that these shares of the way from low to high are."""
+        low, high = self._bounds
+        numbers = low + np.array(shares[: self.count]) * (high - low)
+        return np.minimum(np.maximum(numbers, low), high).astype(self.dtype).reshape(self.shape)
+
+    def idle(self) -> Float[np.ndarray, " A"]:
+        """Return the shares of the way at which the numbers are nearest to 0."""
+        low, high = self._bounds
+        return (np.clip(0.0, low, high) - low) / np.where(high > low, high - low, 1.0)
+
+
+@dataclass(frozen=True)
 class Layout:
     """The agents of a team: what each sees and can do."""
 
     agents: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
     """Of what each sees; it is laid out in one row."""
-    choices: tuple[tuple[int, ...], ...]
-    """Sizes of the parts of each agent's action."""
-    starts: tuple[tuple[int, ...], ...]
-    """The smallest number of each part."""
-    plain: tuple[bool, ...]
-    """Its action is a single number."""
+    acts: tuple[Choice | Reach, ...]
+    """What each can do: all choose, or all have numbers to set."""
     roles: tuple[int, ...]
     """Which agents are alike: those of one name (without its number), who see and can do the same."""
 
@@ -50,16 +100,18 @@ class Layout:
 
     @cached_property
     def mask(self) -> Bool[np.ndarray, "N A"]:
-        """Which actions each agent has."""
-        counts = np.array([int(np.prod(parts)) for parts in self.choices])
+        """Which actions each agent has, or which numbers its action has."""
+        counts = np.array([acts.count for acts in self.acts])
         return np.arange(counts.max()) < counts[:, None]
 
-    def action(self, agent: int, choice: int) -> Any:
-        """What an agent's choice is there: a number, or an array of several."""
-        if self.plain[agent]:
-            return choice + self.starts[agent][0]
-        parts = np.unravel_index(choice, self.choices[agent])
-        return np.array(parts, np.int64) + np.array(self.starts[agent])
+    @property
+    def continuous(self) -> bool:
+        """Whether actions are numbers between bounds."""
+        return isinstance(self.acts[0], Reach)
+
+    def action(self, agent: int, chosen: Any) -> Any:
+        """Return what an agent's action is there."""
+        return self.acts[agent].taken(chosen)
 
 
 class Padded(Environment):
@@ -78,6 +130,11 @@ class Padded(Environment):
         return self.layout.mask.shape[1]
 
     @property
+    def continuous_actions(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether actions are numbers."""
+        return self.layout.continuous
+
+    @property
     def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """O: the most that an agent sees, and its role."""
         return self.layout.observation_size
@@ -86,18 +143,23 @@ class Padded(Environment):
 def lay_out(task: str, agents: Sequence[str], seen: Mapping[str, Any], does: Mapping[str, Any]) -> Layout:
     """Read Gymnasium's spaces of what agents see and do. Raises ConfigError for one that does not fit."""
     shapes = [_shape(task, agent, seen[agent]) for agent in agents]
-    parts = [_parts(task, agent, does[agent]) for agent in agents]
+    acts = [_acts(task, agent, does[agent]) for agent in agents]
+    odd = next((k for k, one in enumerate(acts) if type(one) is not type(acts[0])), None)
+    if odd is not None:
+        raise ConfigError(
+            f"{agents[odd]} of {task} acts by a {type(does[agents[odd]]).__name__} and {agents[0]} by a "
+            f"{type(does[agents[0]]).__name__}: in a team that learns together all choose or all set numbers; offer "
+            "the one or the other in a wrapper of the environment"
+        )
     kinds = [
-        (re.sub(r"_?\d+$", "", str(agent)), shape, part)
-        for agent, shape, part in zip(agents, shapes, parts, strict=True)
+        (re.sub(r"_?\d+$", "", str(agent)), shape, act)
+        for agent, shape, act in zip(agents, shapes, acts, strict=True)
     ]
     known = list(dict.fromkeys(kinds))
     return Layout(
         agents=tuple(agents),
         shapes=tuple(shapes),
-        choices=tuple(sizes for sizes, _, _ in parts),
-        starts=tuple(starts for _, starts, _ in parts),
-        plain=tuple(plain for _, _, plain in parts),
+        acts=tuple(acts),
         roles=tuple(known.index(kind) for kind in kinds),
     )
 
@@ -119,15 +181,17 @@ def _shape(task: str, agent: str, space: Any) -> tuple[int, ...]:
     return tuple(space.shape)
 
 
-def _parts(task: str, agent: str, space: Any) -> tuple[tuple[int, ...], tuple[int, ...], bool]:
-    """Sizes and first numbers of the parts of an action, and whether it is a single number."""
+def _acts(task: str, agent: str, space: Any) -> Choice | Reach:
+    """What an agent can do."""
     kind = type(space).__name__
     if kind == "Discrete":
-        return (int(space.n),), (int(getattr(space, "start", 0)),), True
+        return Choice((int(space.n),), (int(getattr(space, "start", 0)),), True)
+    if kind == "Box":
+        return _reach(task, agent, space)
     if kind not in ("MultiDiscrete", "MultiBinary"):
         raise ConfigError(
             f"{agent} of {task} acts by a {kind}: gacrl's agents choose among actions (Discrete, MultiDiscrete, "
-            "MultiBinary); offer them a choice in a wrapper of the environment"
+            "MultiBinary) or set numbers (Box); offer them one of these in a wrapper of the environment"
         )
     sizes = [2] * int(np.prod(space.shape)) if kind == "MultiBinary" else np.ravel(space.nvec).tolist()
     starts = np.ravel(getattr(space, "start", np.zeros(len(sizes)))).astype(int).tolist()
@@ -136,4 +200,13 @@ def _parts(task: str, agent: str, space: Any) -> tuple[tuple[int, ...], tuple[in
             f"{agent} of {task} has {int(np.prod(sizes))} actions, {' × '.join(map(str, sizes))}, and at most "
             f"{MOST_CHOICES} are taken apart: offer it fewer in a wrapper of the environment"
         )
-    return tuple(sizes), tuple(starts), False
+    return Choice(tuple(sizes), tuple(starts), False)
+
+
+def _reach(task: str, agent: str, space: Any) -> Reach:
+    low, high = np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and low.size):
+        raise ConfigError(
+            f"{agent} of {task} acts by a Box without bounds, {space}: bound it in a wrapper of the environment"
+        )
+    return Reach(tuple(low.tolist()), tuple(high.tolist()), tuple(space.shape), str(space.dtype))

@@ -1,9 +1,10 @@
 """PettingZoo's parallel environments as tasks: by a function that makes one, or by the module that has one."""
 
+import contextlib
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
@@ -12,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gacrl.config.checks import unknown
 from gacrl.envs.environment import EnvParams, EnvState, TimeStep, as_floats, observe
 from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
 from gacrl.tasks.foreign.arguments import as_settings, plain_arguments, version_of
-from gacrl.tasks.foreign.layout import Layout, Padded, lay_out
-from gacrl.tasks.foreign.worlds import Scripted, World, Worlds
+from gacrl.tasks.foreign.crew import Crew
+from gacrl.tasks.foreign.layout import Layout, Padded, Reach, lay_out
+from gacrl.tasks.foreign.worlds import Recipe, Scripted
 from gacrl.tasks.task import Task
 from gacrl.types import Observation, PRNGKey
 
@@ -53,22 +56,45 @@ def from_pettingzoo(
     return _task(name or maker.own_name(), maker, dict(scripted))
 
 
-def by_module(name: str) -> Own:
-    """Return the task that `pettingzoo:MODULE` names, as `--env` has it. Raises ConfigError."""
-    module_name = name.removeprefix(SCHEME)
+def by_name(name: str) -> Own:
+    """Return the task that `pettingzoo:MODULE` or `pettingzoo:ID` names, as `--env` has it. Raises ConfigError.
+
+    An ID is one of PettingZoo's registry, which has a slash in it: `sisl/pursuit_v5`.
+    """
+    named = name.removeprefix(SCHEME)
+    spec = _registered(name, named) if "/" in named else None
+    if spec is not None and callable(spec.entry_point):
+        task = _task(name, _Maker(spec.make, inspect.signature(spec.entry_point)), {})
+        return Own(task, task.settings())
+    module_name = named if spec is None else str(spec.entry_point).partition(":")[0]
     try:
         module = import_module(module_name)
     except ImportError as error:
         raise ConfigError(
             f"--env {name}: {error}; install it, or name a module that has `parallel_env`"
         ) from error
-    make_env = getattr(module, "parallel_env", None)
+    make_env = getattr(module, "parallel_env", None) if spec is None else spec.make
     if make_env is None:
         turns = hasattr(module, "env") or hasattr(module, "raw_env")
         raise ConfigError(f"--env {name}: {_turn_based('the module') if turns else 'it has no `parallel_env`'}")
     signature = inspect.signature(getattr(module, "raw_env", make_env))  # parallel_env itself takes **kwargs
     task = _task(name, _Maker(make_env, signature), {})
     return Own(task, task.settings(), digest=version_of(module_name))
+
+
+def _registered(name: str, named: str) -> Any:
+    """Look an environment up in PettingZoo's registry. Raises ConfigError."""
+    import pettingzoo
+    from pettingzoo.env_registry.exceptions import PettingZooRegistryError
+
+    try:
+        return pettingzoo.spec("parallel", named)
+    except PettingZooRegistryError as error:
+        with contextlib.suppress(PettingZooRegistryError):
+            pettingzoo.spec("aec", named)
+            raise ConfigError(f"--env {name}: {_turn_based('the environment')}") from error
+        known = list(pettingzoo.parallel_registry)
+        raise ConfigError(f"--env {name}: {unknown('parallel environment', named, known)}") from error
 
 
 def _turn_based(what: str) -> str:
@@ -145,6 +171,8 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
     layout: Layout
     max_cycles: int
     scripted: Scripted
+    crew: Crew | None = None
+    """The processes in which copies are opened; None: they are opened here."""
 
     @classmethod
     def of(cls, task: str, maker: _Maker, settings: Any, scripted: Scripted) -> "Zoo":
@@ -167,12 +195,18 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
 
     def open(self, copies: int, seen: bool = False) -> Copies:
         """Make so many environments."""
-        return Worlds(
-            [
-                World(self.task, self.maker.make(self.settings, seen), self.layout, self.max_cycles, self.scripted)
-                for _ in range(copies)
-            ]
-        )
+        make = partial(self.maker.make, self.settings)
+        recipe = Recipe(self.task, make, self.layout, self.max_cycles, dict(self.scripted))
+        return recipe.open(copies, seen) if self.crew is None else self.crew.open(recipe, copies, seen)
+
+    def over(self, crew: Crew) -> "Zoo":
+        """Return the same whose copies are opened by a crew."""
+        return replace(self, crew=crew)
+
+    def close(self) -> None:
+        """End the processes, where there are some."""
+        if self.crew is not None:
+            self.crew.close()
 
     def step(
         self, state: EnvState, action: Array, key: PRNGKey, params: EnvParams = ()
@@ -199,7 +233,15 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
 
     def unstack(self, actions: Array | np.ndarray) -> list[Any]:
         """Return the agents' actions as the environment takes them."""
-        return [self.layout.action(i, int(choice)) for i, choice in enumerate(np.asarray(actions))]
+        return [self.layout.action(i, chosen) for i, chosen in enumerate(np.asarray(actions).tolist())]
+
+    def idle(self) -> Float[np.ndarray, "N A"]:
+        """Return the actions nearest to 0."""
+        shares = np.zeros((self.num_agents, self.num_actions), np.float32)
+        for place, acts in zip(shares, self.layout.acts, strict=True):
+            if isinstance(acts, Reach):
+                place[: acts.count] = acts.idle()
+        return shares
 
 
 def _require_parallel(task: str, env: Any) -> None:

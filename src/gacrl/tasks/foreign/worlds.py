@@ -3,13 +3,14 @@
 import contextlib
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from gacrl.envs.environment import TimeStep
-from gacrl.envs.hosted import Copies
+from gacrl.envs.hosted import Actions, Copies
 from gacrl.errors import Faulty
 from gacrl.tasks.foreign.layout import Layout
 from gacrl.types import Observation
@@ -49,7 +50,7 @@ class World:
         self.terminated = self.truncated = False
         self._see(seen, infos, self.there)
 
-    def step(self, choices: Int[np.ndarray, " N"]) -> None:
+    def step(self, choices: Int[np.ndarray, " N"] | Float[np.ndarray, "N A"]) -> None:
         """Take a step. Raises Faulty."""
         acting = [(i, agent) for i, agent in enumerate(self.layout.agents) if self.there[i]]
         actions = {
@@ -172,6 +173,24 @@ class World:
             ) from error
 
 
+@dataclass(frozen=True)
+class Recipe:
+    """How copies of an environment are made, here or in another process."""
+
+    task: str
+    make: Callable[[bool], Any]
+    """(whether pictures will be asked for) -> a new environment."""
+    layout: Layout
+    max_cycles: int
+    scripted: Scripted
+
+    def open(self, copies: int, seen: bool = False) -> "Worlds":
+        """Make so many. Raises ConfigError."""
+        return Worlds(
+            [World(self.task, self.make(seen), self.layout, self.max_cycles, self.scripted) for _ in range(copies)]
+        )
+
+
 class Worlds(Copies):
     """Several environments, one after the other."""
 
@@ -184,7 +203,7 @@ class Worlds(Copies):
             self._worlds[copy].begin(None if seeds is None else seeds[k])
         return self._observation()
 
-    def step(self, actions: Int[np.ndarray, "C N"], going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
+    def step(self, actions: Actions, going: Bool[np.ndarray, " C"] | None = None) -> TimeStep:
         """Step those that are going."""
         for k, world in enumerate(self._worlds):
             if going is None or going[k]:

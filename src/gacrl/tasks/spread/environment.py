@@ -102,6 +102,7 @@ class Spread(SpreadSettings, Environment):
     """The task of these settings. Its numbers are in `SpreadParams`; those of the settings are where they start."""
 
     observes_state: ClassVar[bool] = True
+    pushes: ClassVar[bool] = True
 
     @property
     def num_actions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
