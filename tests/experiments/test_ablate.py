@@ -68,9 +68,18 @@ def test_networks_without_a_part_are_about_as_large(planned: dict[str, Planned])
     assert shrunk < 0.95 * whole, "what was evened out"
 
 
+CLEAN = {"git_commit": "c0ffee", "jax": "0.10.2"}
+
+
+def begin(config: RunConfig, out: Path) -> RunFolder:
+    folder = RunFolder.create(out, config)
+    folder.origin_file.write_text(json.dumps({"task": {"name": "spread"}, "versions": CLEAN}), encoding="utf-8")
+    return folder
+
+
 def finish(config: RunConfig, out: Path, score: float) -> session.Ended:
     """A finished run of made-up numbers: seeds a little around the score."""
-    folder = RunFolder.create(out, config)
+    folder = begin(config, out)
     folder.append_metrics(
         [
             {
@@ -84,7 +93,8 @@ def finish(config: RunConfig, out: Path, score: float) -> session.Ended:
         ]
     )
     values = {"values": [score + 0.001 * k for k in range(config.num_seeds)]}
-    summary = {"final": {"greedy": dict.fromkeys(METRICS, values)}}
+    of_better = {"git_commit": "decade-dirty", "jax": "0.11.0"} if score == 0.95 else CLEAN
+    summary = {"final": {"greedy": dict.fromkeys(METRICS, values)}, "versions": of_better}
     folder.write_summary(summary)
     return session.Ended(out, config, STEPS[-1], summary)
 
@@ -97,7 +107,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
     def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Ended:
         started.append(config)
         if config.env.reward == "mpe2":
-            RunFolder.create(out, config).write_diverged("seed 0 diverged: loss is nan")
+            begin(config, out).write_diverged("seed 0 diverged: loss is nan")
             raise Diverged("seed 0 diverged: loss is nan; try less")
         assert isinstance(config.algorithm, GacrlConfig)
         quiet = config.algorithm.network.communication == "none"
@@ -137,6 +147,13 @@ def test_the_command_says_what_each_part_is_worth(
 
     page = Path(answer["report"]).read_text(encoding="utf-8")
     assert "diverged: seed 0 diverged" in page
+    for doubt in (
+        "not of one version of the code, but of c0ffee, decade-dirty.",
+        "changes beside commit decade: no commit has the code",
+        "made with different versions of jax.",
+    ):
+        assert doubt in page, doubt
+    assert [versions["git_commit"] for versions in answer["versions"]] == ["c0ffee", "decade-dirty"]
     assert "0.701 [0.700, 0.702]" in page
     assert "<td>no-messages</td><td>may cost</td><td>collisions</td><td>0.200 [0.199, 0.201]" in page
     assert page.count("<figure>") == 4

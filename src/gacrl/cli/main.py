@@ -366,7 +366,9 @@ def _evaluate(words: Words) -> int:
     )
     print_evaluation(scores)
     if asked.json:
-        print(json.dumps(scores))
+        from gacrl.versions import versions
+
+        print(json.dumps({**scores, "versions": versions()}))
     return 0
 
 

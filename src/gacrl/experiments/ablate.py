@@ -26,6 +26,7 @@ from gacrl.evaluation.statistics import (
     sample_efficiency,
     with_interval,
 )
+from gacrl.experiments.provenance import Versions, commits, doubts, made_by
 from gacrl.experiments.study import (
     Planned,
     Watch,
@@ -116,9 +117,15 @@ class Ablation:
     report: Path
     task: Task
     outcomes: tuple[Outcome, ...]
+    made_by: Sequence[Versions]
+    """The versions that trained the runs."""
 
     def to_dict(self) -> dict[str, Any]:
-        return {"out": str(self.out), "report": str(self.report), **_data(self.task, self.outcomes)}
+        return {"out": str(self.out), "report": str(self.report), **self.results()}
+
+    def results(self) -> dict[str, Any]:
+        """Return every seed's values, what is said of each part, and the versions that trained the runs."""
+        return {**_data(self.task, self.outcomes), "versions": list(self.made_by)}
 
 
 def ablate(
@@ -172,8 +179,9 @@ def ablate(
         return None
     watch.say("writing the report")
     task, outcomes = tasks.find(config.task), tuple(_outcome(run) for run in runs)
-    done = Ablation(out, _report(out, config, configured, outcomes), task, outcomes)
-    (out / "summary.json").write_text(json.dumps(_data(task, outcomes), indent=2) + "\n", encoding="utf-8")
+    made = made_by(run.folder for run in runs)
+    done = Ablation(out, _report(out, config, configured, outcomes, made), task, outcomes, made)
+    (out / "summary.json").write_text(json.dumps(done.results(), indent=2) + "\n", encoding="utf-8")
     return done
 
 
@@ -265,7 +273,9 @@ def _data(task: Task, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     return {"runs": runs}
 
 
-def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome]) -> Path:
+def _report(
+    out: Path, config: RunConfig, configured: int, outcomes: Sequence[Outcome], made: Sequence[Versions]
+) -> Path:
     """configured: gradient steps after each rollout, as they were before the ablation chose its own."""
     page, task = Page("What each part of GACRL is worth"), tasks.find(config.task)
     horizon = task.make(config.env).max_cycles
@@ -278,6 +288,8 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
         "acting network is off, the rest is wider, so that it has about as many parameters; the central critic, which "
         "does not act, is left out of that count."
     )
+    for sentence in doubts(made):
+        page.text(sentence)
     _results(page, task, config, outcomes)
     _what_parts_are_worth(page, task, outcomes)
     ended = [outcome for outcome in outcomes if outcome.diverged is None]
@@ -322,6 +334,7 @@ def _report(out: Path, config: RunConfig, configured: int, outcomes: Sequence[Ou
     )
     page.heading("How this was made")
     page.code(_command(config, outcomes))
+    page.text(f"Code of commit {', '.join(commits(made))}.")
     return page.write(out, "report")
 
 

@@ -31,6 +31,7 @@ from gacrl.evaluation.statistics import (
     with_interval,
 )
 from gacrl.experiments import scoring
+from gacrl.experiments.provenance import Versions, commits, doubts, made_by
 from gacrl.experiments.study import (
     Planned,
     Watch,
@@ -93,6 +94,8 @@ class Talk:
     answer: Answer
     further: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
     """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
+    made_by: Sequence[Versions] = ()
+    """The versions that trained the learners."""
 
     @property
     def measured(self) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -151,6 +154,7 @@ class Talk:
             "needs_talk": answer.needs,
             "uses_talk": answer.uses,
             "sentence": self.sentence,
+            "versions": list(self.made_by),
         }
 
 
@@ -258,7 +262,8 @@ def _read(out: Path, runs: Sequence[Planned]) -> Talk:
     random = float(unscripted[HEADLINE].mean())
     parameters = {run.name: _num_parameters(run.config) for run in runs}
     judged = answer(returns, played, random)
-    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further)
+    made = made_by(run.folder for run in runs)
+    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made)
 
 
 def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArray[np.float64]]:
@@ -270,6 +275,8 @@ def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArr
 def _report(done: Talk) -> Page:
     page, config = Page(f"Does {done.task.name} need talk?"), done.config
     page.text(done.sentence)
+    for sentence in doubts(done.made_by):
+        page.text(sentence)
     page.table(
         ("learner", "what agents hear", "parameters", "return per agent", "every seed"),
         [
@@ -313,6 +320,7 @@ def _report(done: Talk) -> Page:
         "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
     )
     page.code(_command(config))
+    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
     return page
 
 

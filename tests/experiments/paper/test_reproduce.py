@@ -175,8 +175,9 @@ def test_agents_that_flee_are_told_where_that_alone_makes_a_claim_hold():
     claim = next(claim for claim in claims() if claim.id == "superior-shaped")
     (greedy,) = [o for o in judge(claim, made_up({"GACRL": away})).alternatives if o.reading.play == "greedy"]
     assert greedy.agreement == "agrees"
+    assert greedy.verdict == "agrees; told from random; only because the agents flee"
     assert greedy.because.endswith(
-        "only because the agents flee: they are 5 from the nearest landmark (random 1) and earn -396 of MPE2's reward "
+        "the agents flee: they are 5 from the nearest landmark (random 1) and earn -396 of MPE2's reward "
         "an episode (random 0)"
     )
     near = judge(claim, made_up({"GACRL": {"reward_shaped": 90.0}})).alternatives
@@ -590,6 +591,8 @@ def test_a_run_of_other_seeds_than_planned_is_refused(tmp_path: Path):
 def pretend(run: Planned, shift: float, commit: str = "c0ffee") -> None:
     """A finished run folder of made-up numbers."""
     folder = RunFolder.create(run.folder, run.config)
+    versions = {"git_commit": commit, "jax": "0.10.2"}
+    folder.origin_file.write_text(json.dumps({"task": {"name": "spread"}, "versions": versions}), encoding="utf-8")
     seen = series({"reward_shaped": shift})
     names = list(METRICS)
     rows = [
@@ -619,7 +622,7 @@ def pretend(run: Planned, shift: float, commit: str = "c0ffee") -> None:
             "final": {"greedy": final, "sampled": final},
             "references": scripted,
             "wall_seconds": 60.0,
-            "versions": {"git_commit": commit},
+            "versions": versions,
         }
     )
 
@@ -666,7 +669,11 @@ def test_the_command_writes_a_report_that_has_every_claim(
     assert sorted(order, key=written.index) == order, "summary and figures come first, the long tables last"
     data = json.loads((out / "results.json").read_text(encoding="utf-8"))
     results = data["claims"]
-    assert data["commits"] == ["c0ffee", "decade"]
+    assert [versions["git_commit"] for versions in data["versions"]] == ["c0ffee", "decade"]
+    last = {(row["who"], row["trained_on"]): row for row in data["table_3"]}
+    assert ("GACRL", "mpe2") not in last and len(last["GACRL", "paper"]["mean"]["shaped"]) == 2
+    random = last["random", ""]
+    assert random["episodes"] == 2_000 and random["mean"]["raw"] == [pytest.approx(-1.25, abs=0.01)]
     ranking = results[0]["numbers"]
     assert len(ranking["GACRL"]) == 2 and ranking["random"]["blocks"] == 40, "every seed's value is there"
     assert [entry["id"] for entry in results] == [claim.id for claim in claims()]

@@ -123,12 +123,14 @@ class Outcome:
     """What the sentence is made from, as JSON data: every seed's value."""
     detail: str = ""
     """What of it decides, where there are several numbers: it may change though the verdict does not."""
+    caveat: str = ""
+    """What must stand wherever the verdict does."""
     reading: Reading = Reading()
 
     @property
     def verdict(self) -> str:
-        """Both axes in words."""
-        return "; ".join(part for part in (self.agreement, self.chance) if part)
+        """Both axes in words, and what must stand beside them."""
+        return "; ".join(part for part in (self.agreement, self.chance, self.caveat) if part)
 
 
 @dataclass(frozen=True)

@@ -95,15 +95,17 @@ class _Ranking:
             f"{self.measure.label}, GACRL less each: {_listed({**self.less, 'random': random}, self.measure)}, {test}; "
             f"margin {self.margin:.3g}{more}"
         )
+        flight = ""
         if agreement == AGREES and self._reading.play == "greedy":
-            because += _flight(self._reading, self._evidence)
+            flight = _flight(self._reading, self._evidence)
         numbers: dict[str, Any] = {"measure": self.measure.label, "margin": self.margin}
         for who, values in self.values.items():
             own = self.measure.sign * values  # of a scripted policy there are hundreds of blocks
             numbers[who] = (
                 own if who in self._trained else {"mean": own.mean(), "sd": own.std(), "blocks": len(own)}
             )
-        return Outcome(agreement, chance, because, numbers)
+        caveat = "only because the agents flee" if flight else ""
+        return Outcome(agreement, chance, because + flight, numbers, caveat=caveat)
 
 
 def _flight(reading: Reading, evidence: Evidence) -> str:
@@ -115,7 +117,7 @@ def _flight(reading: Reading, evidence: Evidence) -> str:
     if difference(own, random).low <= 0:
         return ""
     return (
-        f"; only because the agents flee: they are {own.mean():.2g} from the nearest landmark (random "
+        f"; the agents flee: they are {own.mean():.2g} from the nearest landmark (random "
         f"{random.mean():.2g}) and earn {earned.mean():.0f} of MPE2's reward an episode (random {by_random.mean():.0f})"
     )
 

@@ -4,7 +4,7 @@ S seeds, K stretches of training (the episodes between two lines of the log), E 
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -18,6 +18,7 @@ from gacrl.config.run import RunConfig
 from gacrl.experiments.paper import references as scripted
 from gacrl.experiments.paper.references import Difficulty, Episodes, difficulty
 from gacrl.experiments.paper.tables import SCRIPTED
+from gacrl.experiments.provenance import Versions, made_by
 from gacrl.experiments.study import reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
@@ -60,8 +61,8 @@ class Series:
     """What the scripted policies reach on the closing evaluation's starts."""
     seconds: float
     """Of all seeds together, evaluations and compilation included."""
-    commit: str = ""
-    """Of the code that trained it, where it is known."""
+    made_by: Sequence[Versions] = ()
+    """The versions that began and ended its training."""
 
     @property
     def closing(self) -> tuple[Metrics, Metrics, int]:
@@ -183,7 +184,7 @@ def _read_series(path: Path) -> Series:
         },
         scripted=summary["references"],
         seconds=float(summary["wall_seconds"]),
-        commit=summary.get("versions", {}).get("git_commit", ""),
+        made_by=made_by([path]),
     )
 
 

@@ -12,13 +12,14 @@ from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.statistics import probability_of_improvement, with_interval
+from gacrl.experiments.paper import final_metrics, report_verdicts
 from gacrl.experiments.paper import report_tables as reproduce_tables
-from gacrl.experiments.paper import report_verdicts
 from gacrl.experiments.paper.claims import Judged
 from gacrl.experiments.paper.evidence import COLUMNS, Evidence
+from gacrl.experiments.paper.final_metrics import interquartile
 from gacrl.experiments.paper.references import EPISODES
-from gacrl.experiments.paper.report_tables import interquartile
 from gacrl.experiments.paper.tables import SCRIPTED
+from gacrl.experiments.provenance import Versions, commits, doubts
 from gacrl.report.page import Page
 
 _INDICATIVE = 10
@@ -34,8 +35,8 @@ def write(out: Path, evidence: Evidence, judged: Sequence[Judged], seeds: int, e
     reproduce_tables.table_1(page, evidence)
     reproduce_tables.environment(page)
     reproduce_tables.table_2(page, evidence)
-    reproduce_tables.table_3(page, evidence)
-    reproduce_tables.agent_distance(page, evidence)
+    final_metrics.table_3(page, evidence)
+    final_metrics.agent_distance(page, evidence)
     reproduce_tables.printed_numbers(page, evidence, judged)
     _extended(page, evidence)
     report_verdicts.method(page)
@@ -45,8 +46,9 @@ def write(out: Path, evidence: Evidence, judged: Sequence[Judged], seeds: int, e
     data = {
         "seeds": seeds,
         "episodes": episodes,
-        "commits": _commits(evidence),
+        "versions": _made_by(evidence),
         "reference_episodes": EPISODES,
+        "table_3": [row.to_dict() for row in final_metrics.rows(evidence)],
         "claims": report_verdicts.results(judged),
     }
     (out / "results.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
@@ -60,9 +62,8 @@ def _opening(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
         + ("" if seeds >= _INDICATIVE else f"With {seeds} seeds all of it is indicative. ")
         + "Every claim is asked two questions, apart: do our runs agree with it, and can random be told from it?"
     )
-    commits = _commits(evidence)
-    if len(commits) > 1:
-        page.text(f"The runs are not of one version of the code, but of {', '.join(commits)}.")
+    for sentence in doubts(_made_by(evidence)):
+        page.text(sentence)
 
 
 def _caveats(page: Page, evidence: Evidence) -> None:
@@ -82,9 +83,12 @@ def _caveats(page: Page, evidence: Evidence) -> None:
         )
 
 
-def _commits(evidence: Evidence) -> list[str]:
-    """Of the code that trained the runs."""
-    return sorted({series.commit or "unknown" for series in evidence.series.values()})
+def _made_by(evidence: Evidence) -> list[Versions]:
+    """Return the versions that trained the runs, each once."""
+    found: list[Versions] = []
+    for series in evidence.series.values():
+        found += [versions for versions in series.made_by if versions not in found]
+    return found
 
 
 def _extended(page: Page, evidence: Evidence) -> None:
@@ -94,7 +98,7 @@ def _extended(page: Page, evidence: Evidence) -> None:
     page.heading("The same with equal switches")
     page.text(
         "MPE2's own task, 25 steps. Every algorithm sees the graph of entities, learns from turned worlds and the "
-        "coverage bonus, plays by the mean over the turned worlds, and has as many steps and about as many parameters. "
+        "coverage bonus, and has as many steps and about as many parameters. "
         "Closing evaluation of 320 episodes, on MPE2's reward: IQM over seeds, 95 % interval."
     )
     shown = {
@@ -141,7 +145,7 @@ def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
         for (column, who), series in evidence.series.items()
     ]
     page.table(("who", "trained on", "seeds", "steps a seed", "time, all seeds", "settings"), rows)
-    page.text(f"Code of commit {', '.join(_commits(evidence))}.")
+    page.text(f"Code of commit {', '.join(commits(_made_by(evidence)))}.")
 
 
 def _settings(config: RunConfig) -> str:

@@ -11,24 +11,16 @@ from jaxtyping import Float
 
 from gacrl.config import files as configuration
 from gacrl.evaluation.evaluate import stream_key
-from gacrl.evaluation.statistics import estimate, sample_efficiency, with_interval
+from gacrl.evaluation.statistics import sample_efficiency, with_interval
 from gacrl.experiments.paper import tables as paper_tables
-from gacrl.experiments.paper.claims import Judged, Measure, Reading, claims, measures
-from gacrl.experiments.paper.evidence import COLUMNS, FINAL_EPISODES, Evidence, MissingRun, Play, measured
+from gacrl.experiments.paper.claims import Judged, Reading, claims, measures
+from gacrl.experiments.paper.evidence import COLUMNS, FINAL_EPISODES, Evidence, measured
 from gacrl.experiments.paper.spans import best_of_random, random_interval
 from gacrl.experiments.paper.spans import inside as is_inside
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.spread.environment import Spread
-
-SHOWN = ("shaped", "raw", "distance", "coverage_0.1", "coverage_theta", "near", "agents")
-"""The measures of the tables."""
-_PLAYS: Mapping[Play, str] = {
-    "training": "end of training",
-    "sampled": "closing evaluation, sampled",
-    "greedy": "closing evaluation, greedy",
-}
 
 
 def table_1(page: Page, evidence: Evidence) -> None:
@@ -141,86 +133,6 @@ def table_2(page: Page, evidence: Evidence) -> None:
     )
 
 
-def table_3(page: Page, evidence: Evidence) -> None:
-    table = paper_tables.printed()["table_3"]
-    page.heading(table["caption"])
-    _table_3_as_defined(page, evidence)
-    for column in ("paper", "mpe2"):
-        for play, title in _PLAYS.items():
-            rows = [
-                [who, *(_interval(evidence, measures()[name], who, play, column) for name in SHOWN)]
-                for who in (*table["rows"], *SCRIPTED)
-            ]
-            page.table(
-                ("who", *(measures()[name].label for name in SHOWN)),
-                rows,
-                f"Trained on {COLUMNS[column]}, {title}: IQM over the seeds [95 % interval]; scripted "
-                f"policies: over blocks of {FINAL_EPISODES} episodes",
-            )
-    page.text(
-        "The closing evaluation plays 320 fixed episodes at θ = 0.5 and local ratio 0.5; the end of training has "
-        "the difficulty of the last episodes, and exploration."
-    )
-    shaped, distance = (
-        [
-            evidence.values(measures()[name].weights, who, "greedy", "paper").mean()
-            for who in ("GACRL", "random", "oracle")
-        ]
-        for name in ("shaped", "distance")
-    )
-    if shaped[0] > shaped[2] and distance[0] > distance[1]:
-        page.text(
-            f"Played greedily, GACRL earns a shaped reward of {shaped[0]:.3g}, beyond the oracle's {shaped[2]:.3g}, "
-            f"at a distance of {distance[0]:.3g} from the nearest landmark (random: {distance[1]:.3g}): equation (1) "
-            "pays for leaving, and the agents leave. Where this reading makes a claim hold, it holds by that."
-        )
-
-
-def _table_3_as_defined(page: Page, evidence: Evidence) -> None:
-    """Mean ± standard deviation over the last episodes, as the paper has it."""
-    table = paper_tables.printed()["table_3"]
-    rows: list[list[str]] = []
-    chosen = ("shaped", "shaped_fixed", "raw", "distance", "coverage_0.1", "coverage_theta")
-    for who, numbers in table["rows"].items():
-        printed = dict(zip(table["columns"], numbers, strict=True))
-        cells = [_plus_minus(*printed[measures()[name].printed]) for name in chosen]
-        rows.append([who, "paper", *cells])
-        for column in ("paper", "mpe2"):
-            if (column, who) in evidence.diverged:
-                rows.append([who, f"ours, trained on {COLUMNS[column]}", *["diverged"] * len(chosen)])
-                continue
-            mean, sd, count = evidence.series[column, who].closing
-            cells = [_plus_minus(*_pooled(measures()[name], mean, sd)) for name in chosen]
-            rows.append([who, f"ours, trained on {COLUMNS[column]}, {count} episodes a seed", *cells])
-    for who in SCRIPTED:
-        played = evidence.references["paper", who].stretches[-1]
-        seen = [measured(measures()[name].weights, played) for name in chosen]
-        rows.append(
-            [who, f"{len(seen[0])} episodes", *(_plus_minus(float(v.mean()), float(v.std())) for v in seen)]
-        )
-    page.table(
-        ("who", "whose", *(measures()[name].label for name in chosen)),
-        rows,
-        "As the paper defines it: mean ± standard deviation over the last episodes of training; ours pooled over "
-        "the seeds. Where 15 environments end together, the stretches that hold the last 50 hold some more.",
-    )
-
-
-def agent_distance(page: Page, evidence: Evidence) -> None:
-    page.heading("The average agent distance, which the paper names and does not report")
-    measure = measures()["agents"]
-    who = (*paper_tables.printed()["table_3"]["rows"], *SCRIPTED)
-    rows = [
-        [
-            name,
-            *(_interval(evidence, measure, name, play, column) for column in ("paper", "mpe2") for play in _PLAYS),
-        ]
-        for name in who
-    ]
-    titles = [f"{COLUMNS[column]}: {title}" for column in ("paper", "mpe2") for title in _PLAYS.values()]
-    page.table(("who", *titles), rows)
-
-
 def printed_numbers(page: Page, evidence: Evidence, judged: Sequence[Judged]) -> None:
     """The means of Table III beside random, doing nothing and the oracle."""
     page.heading("What the printed numbers say")
@@ -300,19 +212,6 @@ def environment_svg() -> str:
     return file.getvalue()
 
 
-def _interval(evidence: Evidence, measure: Measure, who: str, play: Play, column: str) -> str:
-    try:
-        return interquartile(evidence.values(measure.weights, who, play, column))
-    except MissingRun:
-        return "diverged"
-
-
-def _pooled(measure: Measure, mean: Mapping[str, Any], sd: Mapping[str, Any]) -> tuple[float, float]:
-    """Mean over the seeds, and the standard deviation of their episodes; of a measure that is one metric."""
-    ((name, weight),) = measure.weights.items()
-    return float(weight * mean[name].mean()), float(abs(weight) * np.sqrt((sd[name] ** 2).mean()))
-
-
 def _setting(data: Mapping[str, Any], dotted: str) -> Any:
     section, name = dotted.split(".")
     return data[section][name]
@@ -321,10 +220,6 @@ def _setting(data: Mapping[str, Any], dotted: str) -> Any:
 def _values(values: Sequence[Any]) -> str:
     flat = [inner for value in values for inner in (value if isinstance(value, list | tuple) else [value])]
     return ", ".join(f"{value:g}" for value in flat)
-
-
-def _plus_minus(mean: float, sd: float) -> str:
-    return f"{mean:.2f} ± {sd:.2f}"
 
 
 def _with_range(values: Float[np.ndarray, " S"]) -> str:
@@ -338,8 +233,3 @@ def _with_span(episodes: Float[np.ndarray, " E"]) -> str:
 
 def _file(*words: str) -> str:
     return "-".join(word.replace(".", "") for word in words)
-
-
-def interquartile(values: Float[np.ndarray, " S"]) -> str:
-    """The IQM of the seeds and its interval, to be read."""
-    return with_interval(estimate(values), ".3g")
