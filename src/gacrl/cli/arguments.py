@@ -397,24 +397,38 @@ class Talk:
     the talking ones play with their messages silenced, scrambled and delayed. Stopped or killed, the same command
     resumes with what is missing.
 
+    Without --env: the study of all our tasks that need talk, each with every kind of communication and other learners,
+    in runs/talk. Cells that are done are not run again, and the report shows all that are there.
+
     examples:
       gacrl talk --env reference
       gacrl talk --env examples/own_task.py:Beacon --env-steps 10000
       gacrl talk --env colours --env.graph full --env-steps 120000 --out runs/full
       gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
+      gacrl talk --tasks speaker_listener reference colours
+      gacrl talk --tasks reference --kinds discrete tarmac --scale 0.1 --out runs/look
     """
 
     preset: str = "gacrl-talk"
-    """The preset that trains all three."""
+    """The preset that trains all of them."""
     seeds: int = 3
     """Seeds of each."""
     seed: int = 0
     """The first of them."""
-    env_steps: int = 40_000
-    """Environment steps of each seed."""
+    env_steps: int | None = None
+    """Environment steps of each seed, with --env; none: 40,000."""
+    tasks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TASK …")] = ()
+    """Tasks of the study: speaker_listener, reference, colours, colours-full, colours-unnamed, scouts,
+    traffic_junction; none: all."""
+    kinds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KIND …")] = ()
+    """Its learners: none, none-recurrent, told, discrete, soft, dial, commnet, tarmac, ic3net, actions (words among the
+    actions), mappo, mappo-10x, qmix, or messages of your own (--use); none: all. Silent and told ones are always
+    trained: scores run from the ones to the others."""
+    scale: float = 1.0
+    """Factor of its environment steps: those of the tasks are 30,000 to 800,000."""
     outside: ON_TASK = Outside()
     out: Path | None = None
-    """The folder of the runs and the report; by default runs/talk-TASK."""
+    """The folder of the runs and the report; by default runs/talk-TASK, or runs/talk for the study."""
     json: bool = False
     """Make the last line of the output one JSON object."""
 

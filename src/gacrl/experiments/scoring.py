@@ -15,7 +15,7 @@ from gacrl.evaluation import episodes as recording
 from gacrl.evaluation import references
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
-from gacrl.messages.bits import bits_used
+from gacrl.messages.bits import bits_sent, bits_used
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun, open_run
 from gacrl.tasks.task import Task
@@ -175,8 +175,7 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
         pictures=False,
     )
     conversations = env.num_symmetries if config.symmetric_play else 1
-    choices = network.vocabulary + network.gate  # with a gate also to say nothing
-    sent = conversations * network.rounds * float(np.log2(choices))
+    sent = conversations * (bits_sent(env, network) or 0.0)
     used = bits_used(heard)
     return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gacrl import tasks
-from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
@@ -37,8 +36,9 @@ from gacrl.experiments.study import (
     train_missing,
     why_diverged,
 )
+from gacrl.experiments.talking.cells import CAUGHT
+from gacrl.experiments.talking.kinds import hears_by, num_parameters, talker
 from gacrl.messages import interventions
-from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import HEADLINE, MATTERS, Task
@@ -53,9 +53,7 @@ _HEARD: Mapping[str, str] = MappingProxyType(
 )
 _KINDS: Mapping[str, str] = MappingProxyType({SILENT: "none", TALKING: "discrete", TOLD: "told"})
 SENT, SCRAMBLED = "as sent", "scrambled"
-PLAYED: Mapping[str, str] = MappingProxyType(
-    {SENT: "", "silenced": "silence", SCRAMBLED: "scramble", "a step late": "delay 1"}
-)
+PLAYED: Mapping[str, str] = MappingProxyType({SENT: "", **CAUGHT})
 """What happens to the talking learner's messages, and the intervention that does it."""
 ENV_STEPS = 40_000
 EVALUATIONS = 8
@@ -163,7 +161,7 @@ def talk(
     watch = watch or Watch()
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
-    runs = plan(_talking(config, seeds, env_steps), out)
+    runs = plan(talker(config, seeds, env_steps, env_steps // EVALUATIONS), out)
     asked = {"config": configuration.to_dict(runs[1].config)}
     claim_folder(out, "talk.json", asked, "study of talk", lambda held: "another study: choose another --out")
     refuse_other_settings(runs)
@@ -180,18 +178,8 @@ def talk(
 
 def plan(config: RunConfig, out: Path) -> list[Planned]:
     """Plan the three learners. The silent and the told one are as large as the talking one."""
-    wanted = _num_parameters(config)
-    runs: list[Planned] = []
-    for name in LEARNERS:
-        network: dict[str, Any] = {"communication": _KINDS[name]}
-        changes: dict[str, Any] = {"network": network}
-        if name != TALKING:
-            network |= {"parameters": wanted, "gate": False, "word_price": 0.0}  # what only symbols have
-            if getattr(config.algorithm, "critic", None) == "told":
-                changes["critic"] = "central"  # a teacher that is told teaches to talk, not to do without
-        changed = configuration.from_dict({"algorithm": changes}, config)
-        runs.append(Planned(name, changed, out / name))
-    return runs
+    parameters = num_parameters(config)
+    return [Planned(name, hears_by(_KINDS[name], config, parameters), out / name) for name in LEARNERS]
 
 
 def answer(
@@ -203,32 +191,6 @@ def answer(
     learned = float(returns[SILENT].mean()) - random
     needs = worth.low > MATTERS * max(learned, 0.0)
     return Answer(worth, used, random, needs, used.low > MATTERS * max(worth.point, 0.0))
-
-
-def _talking(config: RunConfig, seeds: int, env_steps: int) -> RunConfig:
-    """The settings of the talking learner. Raises UserError for what cannot talk."""
-    network = getattr(config.algorithm, "network", None)
-    if network is None:
-        raise UserError(
-            f"--preset {config.preset} has a network of its own: name one whose messages can be chosen"
-        )
-    env = tasks.find(config.task).make(config.env)
-    if env.num_agents < 2:
-        raise UserError(f"{config.task} has a single agent: nobody is there to talk to")
-    changes = {
-        "num_seeds": seeds,
-        "algorithm": {"network": {"communication": _KINDS[TALKING]}},
-        "training": {"env_steps": env_steps},
-        "evaluation": {"interval": max(env_steps // EVALUATIONS, 1)},
-    }
-    return configuration.from_dict(changes, config)
-
-
-def _num_parameters(config: RunConfig) -> int:
-    env = tasks.find(config.task).make(config.env)
-    actions = choices(env).size
-    network = matched(env, config.algorithm.network, actions)  # pyright: ignore[reportAttributeAccessIssue] checked
-    return acting_parameters(env, network, actions)
 
 
 def _read(out: Path, runs: Sequence[Planned]) -> Talk:
@@ -253,7 +215,7 @@ def _read(out: Path, runs: Sequence[Planned]) -> Talk:
     played = {name: values[HEADLINE] for name, values in caught.items()}
     unscripted = scoring.play("random", episodes, lambda _: config.env, task=config.task)
     random = float(unscripted[HEADLINE].mean())
-    parameters = {run.name: _num_parameters(run.config) for run in runs}
+    parameters = {run.name: num_parameters(run.config) for run in runs}
     judged = answer(returns, played, random)
     return Talk(out, out / "report.html", config, parameters, returns, played, judged, further)
 

@@ -48,6 +48,21 @@ class Part(NamedTuple):
     changes: Mapping[str, Any]
 
 
+class Case(NamedTuple):
+    """A task as the study of talk has it (`gacrl talk`)."""
+
+    env_steps: int
+    """Of each learner."""
+    reached: str
+    """The metric that is to reach .9."""
+    settings: Mapping[str, Any] = MappingProxyType({})
+    """What is set otherwise than usual."""
+    utterances: Mapping[str, Any] | None = None
+    """What is set where words are actions; None: the task has no such words."""
+    moves_tell: bool = False
+    """Silent agents see something that others did: silent ones with a memory are trained as well."""
+
+
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
     """Nothing about the task is a number that could change between steps."""
     return ()
@@ -124,6 +139,8 @@ class Task(NamedTuple):
     """What each action does, by index: it stands beside an exported policy."""
     parts: Mapping[str, Part] = MappingProxyType({})
     """Parts of an ablation that this task alone has."""
+    cases: Mapping[str, Case] = MappingProxyType({})
+    """What the study of talk makes of it, by the names that it has there."""
     summary: str = ""
     """One line on what must be done, for `gacrl tasks`."""
 
