@@ -405,6 +405,7 @@ class Talk:
       gacrl talk --env examples/own_task.py:Beacon --env-steps 10000
       gacrl talk --env colours --env.graph full --env-steps 120000 --out runs/full
       gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
+      gacrl talk --env reference --known docs/data/talk-reference-study.json
       gacrl talk --tasks speaker_listener reference colours
       gacrl talk --tasks reference --kinds discrete tarmac --scale 0.1 --out runs/look
     """
@@ -417,6 +418,9 @@ class Talk:
     """The first of them."""
     env_steps: int | None = None
     """Environment steps of each seed, with --env; none: 40,000."""
+    known: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """With --env: take the silent and the told learner from here, a summary.json of `gacrl talk` with as many steps
+    and the same settings of the task, and train the talking one alone."""
     tasks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TASK …")] = ()
     """Tasks of the study: speaker_listener, reference, colours, colours-full, colours-unnamed, scouts,
     traffic_junction; none: all."""

@@ -103,7 +103,7 @@ def talk(words: Words) -> int:
     env_steps = talk.ENV_STEPS if asked.env_steps is None else asked.env_steps
 
     def study(watch: "Watch") -> "Talk | None":
-        return talk.talk(config, out, asked.seeds, env_steps, watch)
+        return talk.talk(config, out, asked.seeds, env_steps, watch, asked.known)
 
     return _studied(study, out, asked.json, _print_answer)
 
@@ -116,8 +116,9 @@ def _talk_of_all(words: Words) -> int:
     if setting is not None:
         raise UserError(f"{setting} is a setting of one task: name that with --env, or leave {setting} out")
     asked = parsing.parse(arguments.Talk, words, "talk")
-    if asked.env_steps is not None:
-        raise UserError("--env-steps is for one task: name it with --env, or say --scale")
+    for flag, given, mend in (("--env-steps", asked.env_steps, ", or say --scale"), ("--known", asked.known, "")):
+        if given is not None:
+            raise UserError(f"{flag} is for one task: name it with --env{mend}")
     config = replace(presets.preset(asked.preset), seed=asked.seed)
     from gacrl.training.devices import prepare_jax
 

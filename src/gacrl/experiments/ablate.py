@@ -390,7 +390,7 @@ def _against_headline(outcome: Outcome) -> figures.Series:
 def _command(config: RunConfig, outcomes: Sequence[Outcome]) -> str:
     words = ["gacrl ablate", f"--preset {config.preset}", f"--seeds {config.num_seeds}", f"--seed {config.seed}"]
     words += [f"--env-steps {config.training.env_steps}", f"--updates {_updates(config)}"]
-    words += [tasks.flag(config.task).strip()] if tasks.flag(config.task) else []
+    words += [flag] if (flag := tasks.flag(config.task, as_given=True).strip()) else []
     if len(outcomes) <= len(parts_of(config)):
         words += [f"--part {outcome.name}" for outcome in outcomes[1:]]
     return " ".join(words)

@@ -103,7 +103,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
     runs = " ".join(str(run.path) for run in members)
     again = any(run.set_horizon not in (None, comparison.horizon) for run in members)
     horizon = f" --horizon {comparison.horizon}" if again else ""
-    page.code(f"gacrl compare {runs}{horizon}{tasks.flag(comparison.groups[0].config.task)}")
+    page.code(f"gacrl compare {runs}{horizon}{tasks.flag(comparison.groups[0].config.task, as_given=True)}")
     return page.write(folder, PAGE)
 
 
