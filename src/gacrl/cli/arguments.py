@@ -367,11 +367,12 @@ class Ablate:
 
     examples:
       gacrl ablate                                    every part, 5 seeds, 112,500 steps each
+      gacrl ablate --env reference --seeds 3 --env-steps 40000 --out runs/ablation-reference
       gacrl ablate --part no-messages --part no-graph --seeds 2 --env-steps 30000 --out runs/look
     """
 
-    preset: str = "gacrl-112k"
-    """The preset that is taken apart, a GACRL one."""
+    preset: str | None = None
+    """The preset that is taken apart, a GACRL one; none: gacrl-112k, and gacrl-talk on tasks that need talk."""
     part: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """What is taken away; may be given several times. None: everything."""
     seeds: int = 5
@@ -381,7 +382,8 @@ class Ablate:
     env_steps: int | None = None
     """Environment steps of each seed; none: the preset's."""
     updates: int | None = None
-    """Gradient steps after each rollout; none: half of the preset's; all of it takes about an hour on two cores."""
+    """Gradient steps after each rollout; none: half of the preset's, and all on tasks that need talk. All of it takes
+    about an hour on two cores."""
     outside: ON_TASK = Outside()
     out: Path = Path("runs/ablation")
     """The folder of the runs and the report."""

@@ -71,10 +71,11 @@ def ablate(words: Words) -> int:
     from gacrl.training.devices import prepare_jax
 
     prepare_jax(max(asked.seeds, 1))
-    from gacrl.experiments import ablate
+    from gacrl.experiments import ablate, parts
 
     def study(watch: "Watch") -> "Ablation | None":
-        config = replace(presets.preset(asked.preset), seed=asked.seed)
+        preset = presets.preset(asked.preset or parts.usual_preset(words.task))
+        config = replace(preset, seed=asked.seed)
         config = config if words.task is None else configuration.on_task(config, words.task)
         return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
 
