@@ -5,7 +5,7 @@ All have about as many parameters as the learner that sends symbols, and its swi
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from gacrl import tasks
 from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config import presets
+from gacrl.config.algorithms import NetworkConfig
 from gacrl.config.kinds import COMMUNICATION
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
@@ -79,9 +80,15 @@ def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunC
 
 def num_parameters(config: RunConfig) -> int:
     """Count the parameters of the acting network."""
-    env = tasks.find(config.task).make(config.env)
+    return _counted(config.task, config.env, config.algorithm.network)
+
+
+@cache
+def _counted(task: str, settings: Any, network: NetworkConfig) -> int:
+    """The same, once a process: a width is searched for."""
+    env = tasks.find(task).make(settings)
     actions = choices(env).size
-    return acting_parameters(env, matched(env, config.algorithm.network, actions), actions)
+    return acting_parameters(env, matched(env, network, actions), actions)
 
 
 def sends(communication: str, shared: Base) -> RunConfig:

@@ -90,8 +90,9 @@ def _case(made: Page, case: Played) -> None:
     }
     if curves:
         floor, ceiling = case.floor, case.ceiling
-        lines = {floor.who: floor.value} | ({ceiling.who: ceiling.value} if ceiling else {})
-        drawn = figures.curves(curves, "environment steps", headline, lines, begin=0)
+        lines = {f"floor: {floor.who}": floor.value}
+        lines |= {f"ceiling: {ceiling.who}": ceiling.value} if ceiling else {}
+        drawn = figures.curves(curves, "environment steps", headline, lines, begin=0.0)
         made.figure(
             drawn, f"{headline} along training: mean over seeds and its 95 % interval.", f"case-{case.name}"
         )
