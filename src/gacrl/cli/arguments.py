@@ -172,6 +172,7 @@ class Evaluate:
       gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
       gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
       gacrl evaluate runs/gacrl-1 --silence 0 2       what are the messages of these two agents worth?
+      gacrl evaluate RUN --utter --backend mpe2       its symbols as MPE2's utterances (docs/guides/talking.md)
     """
 
     run: tyro.conf.Positional[str]
@@ -185,6 +186,8 @@ class Evaluate:
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
     messages: MESSAGES = Messages()
+    utter: bool = False
+    """Send the symbols as the task's own utterance actions, which are heard a step later."""
     outside: ON_TASK = Outside()
     json: bool = False
     """Make the last line of the output one JSON object."""

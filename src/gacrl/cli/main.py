@@ -355,6 +355,7 @@ def _evaluate(words: Words) -> int:
         warn=_warn,
         task=words.task or tasks.DEFAULT,
         intervention=_intervention(asked.messages),
+        utter=asked.utter,
     )
     print_evaluation(scores)
     if asked.json:

@@ -135,6 +135,9 @@ class Task(NamedTuple):
     comparable: tuple[str, ...] | None = None
     """Attributes of the settings that must be equal in one table; None: all."""
     words: Words = Words()
+    uttered: Callable[[Any, Any], tuple[Any, Any]] | None = None
+    """(Environment, policy that sends symbols) -> the environment in which words are actions, and the policy that
+    utters its symbols there; None: the task has no such actions."""
     actions: Callable[[Settings], Sequence[str]] = unnamed
     """What each action does, by index: it stands beside an exported policy."""
     parts: Mapping[str, Part] = MappingProxyType({})

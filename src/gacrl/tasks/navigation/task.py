@@ -14,6 +14,7 @@ from gacrl.tasks.navigation.settings import (
     ReferenceSettings,
     SpeakerListenerSettings,
 )
+from gacrl.tasks.navigation.uttered import uttered
 from gacrl.tasks.navigation.world import world
 from gacrl.tasks.task import Case, Task, Words
 
@@ -40,6 +41,7 @@ REFERENCE = Task(
     scene=scene,
     world=world,
     comparable=("max_cycles",),
+    uttered=uttered,
     words=Words(mark="landmark", lit="reached"),
     actions=actions,
     cases={"reference": Case(40_000, _ON_GOAL, utterances=_UTTERED)},
