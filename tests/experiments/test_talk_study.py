@@ -67,7 +67,7 @@ def test_silent_agents_have_a_memory_too_where_they_see_what_others_do():
 
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
-    """Runs end at once with made-up numbers; DIAL diverges."""
+    """Runs end at once with made-up numbers: the faster they learn the better, and DIAL diverges."""
     started: list[RunConfig] = []
 
     def start(config: RunConfig, out: Path, watcher: Watcher) -> session.Ended:
@@ -79,10 +79,11 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
             raise Diverged("seed 0 diverged: loss is nan; try less")
         seeds = {HEADLINE: np.array([-0.1, 0.0, 0.1]) + RETURNS[talks], CASE.reached: np.array([0.9, 1.0, 0.8])}
         # reached by the first seed at the second look, by the next at the first, by the last for a moment
-        along = dict(zip(config.seeds, ([0, 0.9, 0.9, 1], [1, 1, 0, 0], [0, 1, 0, 1]), strict=True))
+        along = dict(zip(config.seeds, ([0, 0.9, 0.9, 1], [1, 1, 0, 0], [0, 1, 0, 1]), strict=False))
+        worth = 100 * config.algorithm.learning_rate - 20.0  # along training: the faster the better
         folder.append_metrics(
             [
-                {"seed": seed, "env_steps": step, "greedy": {HEADLINE: -20.0, CASE.reached: along[seed][place]}}
+                {"seed": seed, "env_steps": step, "greedy": {HEADLINE: worth, CASE.reached: along[seed][place]}}
                 for place, step in enumerate(STEPS)
                 for seed in config.seeds
             ]
@@ -143,6 +144,25 @@ def test_scores_run_from_the_best_silent_policy_to_the_best_told_one(
     assert found.finals["told"][HEADLINE].tolist() == [-8.1, -8.0, -7.9] and "3 seeds from 0" in found.says
 
 
+def test_every_learner_may_try_as_many_learning_rates(trained: list[RunConfig], tmp_path: Path):
+    """On seeds of their own; the best one trains on the seeds of the study, and nothing is tried again."""
+    out = tmp_path / "tuned"
+    done = of_all.study(PRESET, out, trials=3, cases=["reference"], kinds=["none"])
+    assert done is not None
+    rate = PRESET.algorithm.learning_rate
+    for learner in (trained[:4], trained[4:]):
+        assert [config.algorithm.learning_rate for config in learner] == pytest.approx(
+            [rate, rate / 3, 3 * rate, 3 * rate]
+        )
+        assert [config.seeds[0] for config in learner] == [1000, 1000, 1000, 0]
+    assert len({config.training.env_steps for config in trained}) == 1
+    again = of_all.study(PRESET, out, trials=3, cases=["reference"], kinds=["none"])
+    assert again is not None and len(trained) == 8 and again.to_dict() == done.to_dict()
+    learners = done.cases["reference"].learners
+    assert {learner.config.algorithm.learning_rate for learner in learners.values()} == {3 * rate}
+    assert "best of 3 learning rates" in done.report.read_text(encoding="utf-8")
+
+
 def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig], tmp_path: Path):
     """The committed study of ten seeds stands in for the silent and the told learner of three new seeds."""
     held = json.loads(KNOWN.read_text(encoding="utf-8"))
@@ -163,6 +183,7 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
         (["--kinds", "tarmak"], "unknown kind of communication 'tarmak': did you mean 'tarmac'?"),
         (["--seeds", "1"], "--seeds must be at least 2, not 1"),
         (["--scale", "0"], "--scale must be above 0 and at most 100, not 0"),
+        (["--trials", "9"], "--trials must be between 1 and 5, not 9"),
         (["--preset", "paper"], "--preset paper has a network of its own"),
         (["--env-steps", "100"], "--env-steps is for one task: name it with --env, or say --scale"),
         (["--env.graph", "full"], "--env.graph is a setting of one task: name that with --env"),

@@ -435,6 +435,8 @@ class Talk:
     trained: scores run from the ones to the others."""
     scale: float = 1.0
     """Factor of its environment steps: those of the tasks are 30,000 to 800,000."""
+    trials: int = 1
+    """Learning rates that each of its learners may try, 1 to 5, on two seeds of their own for as many steps."""
     outside: ON_TASK = Outside()
     out: Path | None = None
     """The folder of the runs and the report; by default runs/talk-TASK, or runs/talk for the study."""

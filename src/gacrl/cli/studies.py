@@ -89,7 +89,12 @@ def talk(words: Words) -> int:
     if words.task is None:
         return _talk_of_all(words)
     asked, rest = parsing.parse_known(arguments.Talk, words, "talk")
-    study_alone = {"--tasks": asked.tasks, "--kinds": asked.kinds, "--scale": asked.scale != 1.0}
+    study_alone = {
+        "--tasks": asked.tasks,
+        "--kinds": asked.kinds,
+        "--scale": asked.scale != 1.0,
+        "--trials": asked.trials != 1,
+    }
     for flag, given in study_alone.items():
         if given:
             raise UserError(f"{flag} is for the study of all tasks: leave --env out, or {flag}")
@@ -129,7 +134,7 @@ def _talk_of_all(words: Words) -> int:
     out = asked.out or Path("runs") / "talk"
 
     def work(watch: "Watch") -> "TalkOfAll | None":
-        return study.study(config, out, asked.seeds, asked.scale, asked.tasks, asked.kinds, watch)
+        return study.study(config, out, asked.seeds, asked.scale, asked.trials, asked.tasks, asked.kinds, watch)
 
     return _studied(work, out, asked.json, _print_scores)
 

@@ -80,7 +80,9 @@ def score_run(
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
         opened = open_run(run, change, warn, intervention)
-        require(not utter or intervention is None, "what is uttered arrives: leave --utter or the intervention out")
+        require(
+            not utter or intervention is None, "what is uttered arrives: leave --utter or the intervention out"
+        )
         done = _in_backend(backend, intervention, opened.trainer.intervention, warn)
         played = Played(opened.task, opened.config.env)
         _require_room(played, episodes, opened.trainer.memory)

@@ -12,15 +12,19 @@ from gacrl.report import figures
 from gacrl.report.page import Page
 
 
-def page(cases: Mapping[str, Played], config: RunConfig, seeds: int, command: str) -> Page:
-    """Make the page of what is there. config: the settings that the learners start from."""
+def page(cases: Mapping[str, Played], config: RunConfig, seeds: int, trials: int, command: str) -> Page:
+    """Make the page of what is there. config: the settings that the learners start from. trials: of each."""
     made = Page("Which tasks need talk, and which talk do they need?")
     made.text(
         f"The learner of {config.preset} with every kind of communication, and other learners with symbols, at about "
         f"as many parameters; {seeds} seeds from {config.seed}. Greedy, last parameters, fixed episodes. A score is 0 "
         "at the best silent policy, scripted or trained, and 1 at the best one that is told everything; in brackets "
-        "the 95 % bootstrap interval over seeds, with both ends of the scale as they are. Settings that the preset "
-        "brings were found for symbols: other kinds of communication were not tuned."
+        "the 95 % bootstrap interval over seeds, with both ends of the scale as they are."
+    )
+    made.text(
+        f"Every learner took the best of {trials} learning rates, found on two seeds of their own from 1000."
+        if trials > 1
+        else "Settings that the preset brings were found for symbols. No other kind of communication was tuned."
     )
     made.table(("", *cases), scores(cases), "Scores.")
     names = _kinds(cases)
