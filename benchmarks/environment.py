@@ -165,24 +165,28 @@ def compare(rounds: int, core: int) -> dict[str, dict[str, list[float]]]:
     return ratios
 
 
-def of_tasks(names: list[str], rounds: int, core: int) -> None:
-    """Environment steps a second of other tasks, here and in JaxMARL where it can be installed."""
+def of_tasks(names: list[str], rounds: int, core: int) -> dict[str, dict[str, list[float]]]:
+    """How many times as fast as JaxMARL in other tasks, per number of environments and round; {} without JaxMARL."""
     python = peers.python_of("jaxmarl")
     us = peers.Side("ours", sys.executable, __file__, core)
     peer = None if python is None else peers.Side("jaxmarl", python, __file__, core)
+    ratios: dict[str, dict[str, list[float]]] = {}
     for name in names:
         for size in SIZES[:3]:
             pairs = [
-                (side.ask(num_envs=size, task=name) if side else None)
+                [side.ask(num_envs=size, task=name) if side else None for side in (us, peer)]
                 for _ in range(rounds)
-                for side in (us, peer)
             ]
-            mine, theirs = ([size / seconds for seconds in pairs[k::2] if seconds] for k in (0, 1))
-            beside = f", jaxmarl {peers.spread(theirs)}" if theirs else ""
-            print(f"{name:16} {size:6,} environments: ours {peers.spread(mine)} steps/s{beside}", flush=True)
+            mine, theirs = ([size / pair[k] for pair in pairs if pair[k]] for k in (0, 1))
+            print(f"{name:16} {size:6,} environments: ours {peers.spread(mine)} steps/s", flush=True)
+            if len(theirs) == len(mine) == rounds:
+                found = [us / them for us, them in zip(mine, theirs, strict=True)]
+                ratios.setdefault(name, {})[str(size)] = found
+                print(f"{'':16} jaxmarl {peers.spread(theirs)}; {peers.spread(found)} times as fast", flush=True)
     for side in (us, peer):
         if side is not None:
             side.close()
+    return ratios
 
 
 def against_team_size(sizes: list[int], core: int) -> None:
@@ -203,18 +207,19 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=0, help="the core that all sides are pinned to")
     parser.add_argument("--agents", type=int, nargs="+", help="instead: ours alone, against the number of agents")
     parser.add_argument("--task", nargs="+", choices=JAXMARL, help="instead: these tasks, ours and JaxMARL's")
-    parser.add_argument("--json", action="store_true", help="end with one line: {ratio: {peer: {size: value}}}")
+    parser.add_argument(
+        "--json", action="store_true", help="end with one line: {ratio: {peer or task: {size: value}}}"
+    )
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.serve:
         side = {"ours": ours, "jaxmarl": jaxmarl, "vmas": vmas}[asked.serve]
         peers.serve(lambda **request: side(**request)())
-    elif asked.task:
-        of_tasks(asked.task, asked.rounds, asked.core)
     elif asked.agents:
         against_team_size(asked.agents, asked.core)
     else:
-        ratios = compare(asked.rounds, asked.core)
+        measure = functools.partial(of_tasks, asked.task) if asked.task else compare
+        ratios = measure(asked.rounds, asked.core)
         if asked.json:
             print(json.dumps(peers.summary(ratios)))
 

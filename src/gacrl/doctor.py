@@ -66,10 +66,10 @@ def checks() -> list[Check]:
     ]
     seen: list[Trial] = []
     for name in presets.PRESETS:
-        if name.startswith(("graph-", "gacrl-")):  # learners of the others; what they see more shows only in space
+        if name.startswith("graph-"):  # learners of the others; what they see more shows only in space
             continue
         asked = trial(presets.preset(name).algorithm)
-        if asked not in seen:  # presets may differ by their task alone
+        if asked not in seen:  # presets may differ by their task alone, or by how far agents see
             found.append(Check(f"{name} on the probes", 1.0, partial(_learns, name, asked)))
         seen.append(asked)
     return found

@@ -59,12 +59,12 @@ def test_each_run_differs_from_the_whole_in_its_part_alone(planned: dict[str, Pl
 
 
 def test_networks_without_a_part_are_about_as_large(planned: dict[str, Planned]):
-    sizes = {name: ablate._num_parameters(run.config) for name, run in planned.items()}
+    sizes = {name: ablate.num_parameters(run.config) for name, run in planned.items()}
     whole = sizes[FULL]
     assert all(abs(size - whole) < 0.05 * whole for size in sizes.values()), sizes
     narrow = replace(planned["no-messages"].config.algorithm.network, parameters=None)  # pyright: ignore
     without = replace(planned["no-messages"].config.algorithm, network=narrow)
-    shrunk = ablate._num_parameters(replace(planned["no-messages"].config, algorithm=without))
+    shrunk = ablate.num_parameters(replace(planned["no-messages"].config, algorithm=without))
     assert shrunk < 0.95 * whole, "what was evened out"
 
 

@@ -65,7 +65,7 @@ def test_the_sentence_says_both():
 
 def test_the_three_learners_are_about_as_large(tmp_path: Path):
     runs = talk.plan(ON_REFERENCE, tmp_path)
-    sizes = [talk._num_parameters(run.config) for run in runs]
+    sizes = [talk.num_parameters(run.config) for run in runs]
     assert [run.name for run in runs] == list(LEARNERS)
     assert max(sizes) / min(sizes) < 1.05, sizes
     assert len({run.config.algorithm.network.communication for run in runs}) == 3  # pyright: ignore[reportAttributeAccessIssue]

@@ -190,6 +190,7 @@ class Evaluate:
       gacrl evaluate runs/paper-1 --horizon 25 --backend mpe2
       gacrl evaluate oracle --num-agents 10 --arena-scale 1.83 --horizon 75
       gacrl evaluate runs/gacrl-1 --silence 0 2       what are the messages of these two agents worth?
+      gacrl evaluate RUN --utter --backend mpe2       its symbols as MPE2's utterances (docs/guides/talking.md)
     """
 
     run: tyro.conf.Positional[str]
@@ -203,6 +204,8 @@ class Evaluate:
     num_agents: int | None = None
     """Play with another number of agents (short for --env.num-agents)."""
     messages: MESSAGES = Messages()
+    utter: bool = False
+    """Send the symbols as the task's own utterance actions, which are heard a step later."""
     outside: ON_TASK = Outside()
     json: bool = False
     """Make the last line of the output one JSON object."""
@@ -420,11 +423,12 @@ class Ablate:
 
     examples:
       gacrl ablate                                    every part, 5 seeds, 112,500 steps each
+      gacrl ablate --env reference --seeds 3 --env-steps 40000 --out runs/ablation-reference
       gacrl ablate --part no-messages --part no-graph --seeds 2 --env-steps 30000 --out runs/look
     """
 
-    preset: str = "gacrl-112k"
-    """The preset that is taken apart, a GACRL one."""
+    preset: str | None = None
+    """The preset that is taken apart, a GACRL one; none: gacrl-112k, and gacrl-talk on tasks that need talk."""
     part: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """What is taken away; may be given several times. None: everything."""
     seeds: int = 5
@@ -434,7 +438,8 @@ class Ablate:
     env_steps: int | None = None
     """Environment steps of each seed; none: the preset's."""
     updates: int | None = None
-    """Gradient steps after each rollout; none: half of the preset's; all of it takes about an hour on two cores."""
+    """Gradient steps after each rollout; none: half of the preset's, and all on tasks that need talk. All of it takes
+    about an hour on two cores."""
     outside: ON_TASK = Outside()
     out: Path = Path("runs/ablation")
     """The folder of the runs and the report."""
@@ -450,24 +455,44 @@ class Talk:
     the talking ones play with their messages silenced, scrambled and delayed. Stopped or killed, the same command
     resumes with what is missing.
 
+    Without --env: the study of all our tasks that need talk, each with every kind of communication and other learners,
+    in runs/talk. Cells that are done are not run again, and the report shows all that are there.
+
     examples:
       gacrl talk --env reference
       gacrl talk --env examples/own_task.py:Beacon --env-steps 10000
       gacrl talk --env colours --env.graph full --env-steps 120000 --out runs/full
       gacrl talk --env colours --preset ippo --env-steps 1e6 --seeds 5 --out runs/colours
+      gacrl talk --env reference --known docs/data/talk-reference-study.json
+      gacrl talk --tasks speaker_listener reference colours
+      gacrl talk --tasks reference --kinds discrete tarmac --scale 0.1 --out runs/look
     """
 
     preset: str = "gacrl-talk"
-    """The preset that trains all three."""
+    """The preset that trains all of them."""
     seeds: int = 3
     """Seeds of each."""
     seed: int = 0
     """The first of them."""
-    env_steps: int = 40_000
-    """Environment steps of each seed."""
+    env_steps: int | None = None
+    """Environment steps of each seed, with --env; none: 40,000."""
+    known: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """With --env: take the silent and the told learner from here, a summary.json of `gacrl talk` with as many steps
+    and the same settings of the task, and train the talking one alone."""
+    tasks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TASK …")] = ()
+    """Tasks of the study: speaker_listener, reference, colours, colours-full, colours-unnamed, scouts,
+    traffic_junction; none: all."""
+    kinds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KIND …")] = ()
+    """Its learners: none, none-recurrent, told, discrete, soft, dial, commnet, tarmac, ic3net, actions (words among the
+    actions), mappo, mappo-10x, qmix, or messages of your own (--use); none: all. Silent and told ones are always
+    trained: scores run from the ones to the others."""
+    scale: float = 1.0
+    """Factor of its environment steps: those of the tasks are 30,000 to 800,000."""
+    trials: int = 1
+    """Learning rates that each of its learners may try, 1 to 5, on two seeds of their own for as many steps."""
     outside: ON_TASK = Outside()
     out: Path | None = None
-    """The folder of the runs and the report; by default runs/talk-TASK."""
+    """The folder of the runs and the report; by default runs/talk-TASK, or runs/talk for the study."""
     json: bool = False
     """Make the last line of the output one JSON object."""
 

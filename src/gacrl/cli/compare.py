@@ -42,7 +42,7 @@ def compare(words: Words) -> int:
 
             galleries = replays.record(comparison, warn)
         typed = shlex.join(word for word in words if word != "--overwrite")
-        command = f"gacrl compare {typed}{tasks.flag(comparison.groups[0].config.task)}"
+        command = f"gacrl compare {typed}{tasks.flag(comparison.groups[0].config.task, as_given=True)}"
         written.append(f"page       {pages.write_page(comparison, asked.out, command, galleries)}")
     if asked.marl_eval is not None:
         asked.marl_eval.write_text(json.dumps(data.to_marl_eval(comparison)) + "\n", encoding="utf-8")

@@ -363,6 +363,7 @@ def _evaluate(words: Words) -> int:
         warn=warn,
         task=words.task or tasks.DEFAULT,
         intervention=_intervention(asked.messages),
+        utter=asked.utter,
     )
     print_evaluation(scores)
     if asked.json:

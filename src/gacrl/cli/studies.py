@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from gacrl.experiments.search import Search
     from gacrl.experiments.study import Watch
     from gacrl.experiments.talk import Talk
+    from gacrl.experiments.talking.study import Study as TalkOfAll
 
-Study = TypeVar("Study", "Ablation", "Reproduction", "Search", "Talk")
+Study = TypeVar("Study", "Ablation", "Reproduction", "Search", "Talk", "TalkOfAll")
 
 
 def reproduce(words: list[str]) -> int:
@@ -70,10 +71,11 @@ def ablate(words: Words) -> int:
     from gacrl.training.devices import prepare_jax
 
     prepare_jax(max(asked.seeds, 1))
-    from gacrl.experiments import ablate
+    from gacrl.experiments import ablate, parts
 
     def study(watch: "Watch") -> "Ablation | None":
-        config = replace(presets.preset(asked.preset), seed=asked.seed)
+        preset = presets.preset(asked.preset or parts.usual_preset(words.task))
+        config = replace(preset, seed=asked.seed)
         config = config if words.task is None else configuration.on_task(config, words.task)
         return ablate.ablate(config, asked.out, asked.seeds, asked.env_steps, asked.part, asked.updates, watch)
 
@@ -81,12 +83,21 @@ def ablate(words: Words) -> int:
 
 
 def talk(words: Words) -> int:
-    """Answer whether a task needs talk, and whether the agents use it."""
+    """Answer whether a task needs talk, and whether the agents use it; without a task, for all of ours."""
     from gacrl.cli import arguments, parsing
 
-    asked, rest = parsing.parse_known(arguments.Talk, words, "talk")
     if words.task is None:
-        raise UserError("say on which task with --env NAME or --env FILE.py:NAME; `gacrl tasks` has ours")
+        return _talk_of_all(words)
+    asked, rest = parsing.parse_known(arguments.Talk, words, "talk")
+    study_alone = {
+        "--tasks": asked.tasks,
+        "--kinds": asked.kinds,
+        "--scale": asked.scale != 1.0,
+        "--trials": asked.trials != 1,
+    }
+    for flag, given in study_alone.items():
+        if given:
+            raise UserError(f"{flag} is for the study of all tasks: leave --env out, or {flag}")
     config = configuration.on_task(replace(presets.preset(asked.preset), seed=asked.seed), words.task)
     config = replace(config, env=parsing.changed(config.env, rest, "talk", arguments.Talk))
     from gacrl.training.devices import prepare_jax
@@ -95,11 +106,47 @@ def talk(words: Words) -> int:
     from gacrl.experiments import talk
 
     out = asked.out or Path("runs") / f"talk-{words.task}"
+    env_steps = talk.ENV_STEPS if asked.env_steps is None else asked.env_steps
 
     def study(watch: "Watch") -> "Talk | None":
-        return talk.talk(config, out, asked.seeds, asked.env_steps, watch)
+        return talk.talk(config, out, asked.seeds, env_steps, watch, asked.known)
 
     return _studied(study, out, asked.json, _print_answer)
+
+
+def _talk_of_all(words: Words) -> int:
+    """The study of all tasks that need talk."""
+    from gacrl.cli import arguments, parsing
+
+    setting = next((word.partition("=")[0] for word in words if word.startswith("--env.")), None)
+    if setting is not None:
+        raise UserError(f"{setting} is a setting of one task: name that with --env, or leave {setting} out")
+    asked = parsing.parse(arguments.Talk, words, "talk")
+    for flag, given, mend in (("--env-steps", asked.env_steps, ", or say --scale"), ("--known", asked.known, "")):
+        if given is not None:
+            raise UserError(f"{flag} is for one task: name it with --env{mend}")
+    config = replace(presets.preset(asked.preset), seed=asked.seed)
+    from gacrl.training.devices import prepare_jax
+
+    prepare_jax(max(asked.seeds, 1))
+    from gacrl.experiments.talking import study
+
+    out = asked.out or Path("runs") / "talk"
+
+    def work(watch: "Watch") -> "TalkOfAll | None":
+        return study.study(config, out, asked.seeds, asked.scale, asked.trials, asked.tasks, asked.kinds, watch)
+
+    return _studied(work, out, asked.json, _print_scores)
+
+
+def _print_scores(done: "TalkOfAll") -> None:
+    """Print the scores of all tasks and kinds."""
+    from gacrl.cli.terminal import console
+    from gacrl.experiments.talking import report
+    from gacrl.report.screen import print_table
+
+    title = "scores: 0 as the best silent policy, 1 as the best one that is told everything"
+    print_table(console(), ("", *done.cases), report.scores(done.cases), title)
 
 
 def _print_answer(done: "Talk") -> None:

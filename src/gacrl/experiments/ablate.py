@@ -7,14 +7,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gacrl import tasks
-from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config.algorithms import GacrlConfig
 from gacrl.config.checks import unknown, whole
@@ -26,6 +24,7 @@ from gacrl.evaluation.statistics import (
     sample_efficiency,
     with_interval,
 )
+from gacrl.experiments.parts import NO_MESSAGES, YOKED, parts_of
 from gacrl.experiments.provenance import Versions, commits, doubts, made_by
 from gacrl.experiments.study import (
     Planned,
@@ -36,60 +35,18 @@ from gacrl.experiments.study import (
     train_missing,
     why_diverged,
 )
+from gacrl.experiments.talking.kinds import num_parameters, with_central_critic
 from gacrl.experiments.worth import CLAIMED_FROM, remarkable, worths
-from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
-from gacrl.tasks.task import Part, Task
+from gacrl.tasks.task import Task
 from gacrl.training.recorder import RunFolder
 
-FULL, YOKED = "all parts", "yoked-exploration"
+FULL = "all parts"
 EVALUATIONS = 45
 """Along a training; also the number of levels that a yoked one replays."""
 EPISODES = 8
 """Of each, for the curves: the closing one is what counts, and has the preset's."""
-
-
-def _network(**changes: Any) -> Mapping[str, Any]:
-    return {"algorithm": {"network": changes}}
-
-
-def _algorithm(**changes: Any) -> Mapping[str, Any]:
-    return {"algorithm": changes}
-
-
-PARTS: Mapping[str, Part] = MappingProxyType(
-    {
-        "no-graph": Part(
-            "layers over the observation vector in place of the entity graph",
-            _network(torso="mlp", second_look=False),
-        ),
-        "no-messages": Part("zero rounds of messages", _network(communication="none", gate=False, word_price=0.0)),
-        "soft-messages": Part("symbols soft in play too, a continuous message", _network(communication="soft")),
-        "straight-through": Part(
-            "one-hot symbols with noise while learning", _network(symbols="straight_through", symbol_noise=1.0)
-        ),
-        "no-second-look": Part("nothing is looked at after the messages", _network(second_look=False)),
-        "no-latent": Part("symbols made of the agent's vector, without a code", _network(latent="none")),
-        "plain-code": Part("a deterministic code", _network(latent="deterministic")),
-        "no-central-critic": Part("values summed, as VDN does", _algorithm(critic="sum")),
-        "linear-exploration": Part("ε and τ fall with time alone", _algorithm(exploration="linear")),
-        "fixed-exploration": Part("ε and τ stay at their end", _algorithm(exploration="fixed")),
-        YOKED: Part(
-            "explores as much as 'all parts' did at that time (mean over its seeds), whatever its own progress is",
-            _algorithm(exploration="yoked"),
-        ),
-        "no-symmetry": Part("what is replayed is not turned", _algorithm(augment=False)),
-        "one-step": Part("targets of one reward", _algorithm(n_step=1)),
-        "no-average": Part("played with the parameters that learn", _algorithm(averaged=False)),
-    }
-)
-"""By what is left, as `gacrl ablate --part` names it; a task may have further ones (`Task.parts`)."""
-
-
-def parts_of(config: RunConfig) -> dict[str, Part]:
-    """All that can be taken away on this task."""
-    return {**PARTS, **tasks.find(config.task).parts}
 
 
 @dataclass(frozen=True)
@@ -139,10 +96,10 @@ def ablate(
 ) -> Ablation | None:
     """Train what is missing under `out`, write `report.html`, `report.md` and `summary.json` there.
 
-    parts: names in `parts_of`; none: all. updates: gradient steps after each rollout; none: half of the configured
-    ones, with which `gacrl-112k` covers as much (docs/results.md) in little more than half the time. Returns None where
-    the watcher's stop ended it early. Raises UserError for fewer than two seeds, a part there is not, settings that are
-    not GACRL's, or a folder that holds something else.
+    parts: names in `parts_of`; none: all. updates: gradient steps after each rollout; none: all of the configured ones
+    on tasks that need talk, elsewhere half, with which `gacrl-112k` covers as much (docs/results.md) in little more
+    than half the time. Returns None where the watcher's stop ended it early. Raises UserError for fewer than two seeds,
+    a part there is not, settings that are not GACRL's, or a folder that holds something else.
     """
     watch, seeds, out = watch or Watch(), whole(seeds, "seeds"), out.absolute()
     if seeds < 2:
@@ -155,7 +112,8 @@ def ablate(
             raise UserError(unknown("part", name, list(known)))
     steps = config.training.env_steps if env_steps is None else whole(env_steps, "env_steps")
     configured = config.algorithm.updates
-    updates = max(configured // 2, 1) if updates is None else whole(updates, "updates")
+    usual = configured if tasks.find(config.task).cases else max(configured // 2, 1)
+    updates = usual if updates is None else whole(updates, "updates")
     config = replace(
         config,
         algorithm=replace(config.algorithm, updates=updates),
@@ -187,16 +145,17 @@ def ablate(
 
 def plan(config: RunConfig, out: Path, parts: Sequence[str]) -> list[Planned]:
     """The run with all parts, and one without each; the yoked one lacks the levels, which the first will give."""
-    wanted, known = _num_parameters(config), parts_of(config)
+    wanted, known = num_parameters(config), parts_of(config)
     runs = [Planned(FULL, config, out / "all-parts")]
     for name in parts:
         changes = dict(known[name].changes)
+        config_of_part = with_central_critic(config) if name == NO_MESSAGES else config
         if "network" in changes.get("algorithm", {}):
             network = {**changes["algorithm"]["network"], "parameters": wanted}
             changes["algorithm"] = {**changes["algorithm"], "network": network}
         if name == YOKED:
             changes["algorithm"] = {**changes["algorithm"], "yoked_progress": [0.0]}
-        runs.append(Planned(name, configuration.from_dict(changes, config), out / name))
+        runs.append(Planned(name, configuration.from_dict(changes, config_of_part), out / name))
     return runs
 
 
@@ -207,15 +166,8 @@ def _yoked(run: Planned, full: Planned) -> Planned:
     span = algorithm.epsilon - algorithm.epsilon_end
     missing = np.clip((_outcome(full).epsilon - algorithm.epsilon_end) / (span or 1.0), 0.0, 1.0)
     progress = 1.0 - np.sqrt(missing.mean(0))
-    changes = _algorithm(yoked_progress=[round(float(value), 4) for value in progress])
+    changes = {"algorithm": {"yoked_progress": [round(float(value), 4) for value in progress]}}
     return replace(run, config=configuration.from_dict(changes, run.config))
-
-
-def _num_parameters(config: RunConfig) -> int:
-    env = tasks.find(config.task).make(config.env)
-    network = config.algorithm.network  # pyright: ignore[reportAttributeAccessIssue] GACRL's, checked
-    actions = choices(env).size
-    return acting_parameters(env, matched(env, network, actions), actions)
 
 
 def _outcome(run: Planned) -> Outcome:
@@ -223,7 +175,7 @@ def _outcome(run: Planned) -> Outcome:
     nothing = np.zeros((0, 0))
     because = why_diverged(run.folder)
     if because is not None:
-        return Outcome(run.name, _num_parameters(run.config), {}, (), nothing, nothing, because)
+        return Outcome(run.name, num_parameters(run.config), {}, (), nothing, nothing, because)
     with reading(run.folder):
         return _read_outcome(run)
 
@@ -237,7 +189,7 @@ def _read_outcome(run: Planned) -> Outcome:
     task = tasks.find(run.config.task)
     return Outcome(
         name=run.name,
-        parameters=_num_parameters(run.config),
+        parameters=num_parameters(run.config),
         final={
             metric: np.array(entry["values"])
             for metric, entry in summary["final"]["greedy"].items()
@@ -403,7 +355,7 @@ def _against_headline(outcome: Outcome) -> figures.Series:
 def _command(config: RunConfig, outcomes: Sequence[Outcome]) -> str:
     words = ["gacrl ablate", f"--preset {config.preset}", f"--seeds {config.num_seeds}", f"--seed {config.seed}"]
     words += [f"--env-steps {config.training.env_steps}", f"--updates {_updates(config)}"]
-    words += [tasks.flag(config.task).strip()] if tasks.flag(config.task) else []
+    words += [flag] if (flag := tasks.flag(config.task, as_given=True).strip()) else []
     if len(outcomes) <= len(parts_of(config)):
         words += [f"--part {outcome.name}" for outcome in outcomes[1:]]
     return " ".join(words)

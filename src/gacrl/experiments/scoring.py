@@ -1,6 +1,6 @@
 """Measuring and recording whatever `RUN` names: a run folder, one member of it, or a scripted policy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, SupportsIndex
 
@@ -11,11 +11,12 @@ from gacrl import tasks
 from gacrl.adapters import mpe2
 from gacrl.config.checks import require, whole
 from gacrl.envs.environment import Environment, EnvParams
+from gacrl.errors import UserError
 from gacrl.evaluation import episodes as recording
 from gacrl.evaluation import references
-from gacrl.evaluation.evaluate import stream_key
+from gacrl.evaluation.evaluate import evaluate, stream_key
 from gacrl.evaluation.summary import normalised, over_seeds
-from gacrl.messages.bits import bits_used
+from gacrl.messages.bits import bits_sent, bits_used
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun, open_run
 from gacrl.tasks.task import Task
@@ -57,10 +58,12 @@ def score_run(
     warn: Warn = lambda sentence: None,
     task: str = tasks.DEFAULT,
     intervention: Intervention | None = None,
+    utter: bool = False,
 ) -> dict[str, Any]:
     """Measure a policy, greedy and sampled, beside the scripted policies on the same starts.
 
-    task: in which a scripted policy plays. intervention: what happens to the policy's messages. Returns {run, backend,
+    task: in which a scripted policy plays. intervention: what happens to the policy's messages. utter: its symbols are
+    sent as the task's own utterance actions, which are heard a step later. Returns {run, backend,
     episodes, horizon, num_agents, task, final: {greedy, sampled}, references} as in `summary.json`; intervention, in
     words, where there is one; and messages where agents send symbols. MPE2 draws its own starts: there, the scripted
     policies play those. Raises UserError.
@@ -69,6 +72,7 @@ def score_run(
     scripted = _scripted_task(run, task, change)
     if scripted is not None:
         _require_words(run, intervention)
+        require(not utter, f"{run} says nothing that could be uttered: leave --utter out")
         played = scripted
         _require_room(played, episodes)
         beside = _references(played, episodes, backend)
@@ -76,12 +80,15 @@ def score_run(
         final = {"greedy": over_seeds({name: np.array([value]) for name, value in metrics.items()})}
     else:
         opened = open_run(run, change, warn, intervention)
+        require(
+            not utter or intervention is None, "what is uttered arrives: leave --utter or the intervention out"
+        )
         done = _in_backend(backend, intervention, opened.trainer.intervention, warn)
         played = Played(opened.task, opened.config.env)
         _require_room(played, episodes, opened.trainer.memory)
         beside = _references(played, episodes, backend)
         final = {
-            kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend))
+            kind: over_seeds(_trained(opened, kind == "sampled", episodes, backend, utter))
             for kind in ("greedy", "sampled")
         }
         messages = _messages(opened)
@@ -96,6 +103,7 @@ def score_run(
         "final": {kind: normalised(metrics, beside, facts) for kind, metrics in final.items()},
         "references": beside,
         **({} if done is None else {"intervention": done.told}),
+        **({"intervention": "symbols are uttered, and heard a step later"} if utter else {}),
         **({} if messages is None else {"messages": messages}),
     }
 
@@ -175,8 +183,7 @@ def _messages(opened: TrainedRun) -> dict[str, float] | None:
         pictures=False,
     )
     conversations = env.num_symmetries if config.symmetric_play else 1
-    choices = network.vocabulary + network.gate  # with a gate also to say nothing
-    sent = conversations * network.rounds * float(np.log2(choices))
+    sent = conversations * (bits_sent(env, network) or 0.0)
     used = bits_used(heard)
     return {"bits_sent": sent, "bits_used_last_round": 0.0 if used is None else used}
 
@@ -232,17 +239,36 @@ def _record(
     return recording.record_many(env, policy, memory, params, key, episodes, intervention, look, pictures)
 
 
-def _trained(opened: TrainedRun, explore: bool, episodes: int, backend: Backend) -> dict[str, np.ndarray]:
+def _trained(
+    opened: TrainedRun, explore: bool, episodes: int, backend: Backend, utter: bool
+) -> dict[str, np.ndarray]:
     """Each metric's mean over the episodes, one number per member [S]."""
     members = opened.config.num_seeds
-    if backend == "jax":
+    if backend == "jax" and not utter:
         metrics = jax.device_get(opened.trainer.evaluate(opened.learners, explore, "report", episodes))
         return {name: values.mean(1)[:members] for name, values in metrics.items()}
-    played = [
-        mpe2.evaluate(opened.env, opened.policy(k, explore), opened.trainer.memory, stream_key("report"), episodes)
-        for k in range(members)
-    ]
+    played = [_member(opened, k, explore, episodes, backend, utter) for k in range(members)]
     return {name: np.array([metrics[name].mean() for metrics in played]) for name in played[0]}
+
+
+def _member(
+    opened: TrainedRun, member: int, explore: bool, episodes: int, backend: Backend, utter: bool
+) -> Mapping[str, Any]:
+    """Each metric of one seed's episodes [K]."""
+    env, policy, memory, key = (
+        opened.env,
+        opened.policy(member, explore),
+        opened.trainer.memory,
+        stream_key("report"),
+    )
+    if utter:
+        if opened.task.uttered is None:
+            raise UserError(f"{opened.task.name} has no utterances among its actions: leave --utter out")
+        env, policy = opened.task.uttered(env, policy)
+    if backend == "mpe2":
+        return mpe2.evaluate(env, policy, memory, key, episodes)
+    params, metrics = opened.trainer.evaluation_params, opened.task.metrics
+    return jax.jit(lambda: evaluate(env, policy, memory, params, key, episodes, metrics=metrics))()
 
 
 def _references(played: Played, episodes: int, backend: Backend) -> dict[str, dict[str, float]]:

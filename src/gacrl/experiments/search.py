@@ -319,8 +319,8 @@ def conclude(spec: Spec, out: Path) -> Search:
     if ranked and ranked[0].state == "finished":
         config = replace(spec.settings_of(ranked[0].values), preset=spec.config.preset)
         (out / "best.json").write_text(configuration.dumps(config), encoding="utf-8")
-        again = f"--config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}{tasks.flag(spec.config.task)}"
-        page.code(f"gacrl train {again}")
+        task = tasks.flag(spec.config.task, as_given=True)
+        page.code(f"gacrl train --config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}{task}")
     page.write(out, "report")
     done = Search(out, out / "report.html", ranked)
     (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")

@@ -15,10 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gacrl import tasks
-from gacrl.algorithms.actions import choices
-from gacrl.algorithms.distributions import distribution
 from gacrl.config import files as configuration
-from gacrl.config.algorithms import PpoConfig
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.statistics import (
@@ -40,8 +37,10 @@ from gacrl.experiments.study import (
     train_missing,
     why_diverged,
 )
+from gacrl.experiments.talking.cells import CAUGHT
+from gacrl.experiments.talking.kinds import hears_by, num_parameters, talker
+from gacrl.experiments.talking.known import Known, read
 from gacrl.messages import interventions
-from gacrl.networks.agent import acting_parameters, matched
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import HEADLINE, MATTERS, Task
@@ -56,9 +55,7 @@ _HEARD: Mapping[str, str] = MappingProxyType(
 )
 _KINDS: Mapping[str, str] = MappingProxyType({SILENT: "none", TALKING: "discrete", TOLD: "told"})
 SENT, SCRAMBLED = "as sent", "scrambled"
-PLAYED: Mapping[str, str] = MappingProxyType(
-    {SENT: "", "silenced": "silence", SCRAMBLED: "scramble", "a step late": "delay 1"}
-)
+PLAYED: Mapping[str, str] = MappingProxyType({SENT: "", **CAUGHT})
 """What happens to the talking learner's messages, and the intervention that does it."""
 ENV_STEPS = 40_000
 EVALUATIONS = 8
@@ -96,6 +93,8 @@ class Talk:
     """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
     made_by: Sequence[Versions] = ()
     """The versions that trained the learners."""
+    known: str = ""
+    """Where the silent and the told learner are from, if they were trained before."""
 
     @property
     def measured(self) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -151,6 +150,7 @@ class Talk:
             "worth": list(answer.worth[:3]),
             "used": list(answer.used),
             "random": answer.random,
+            "known": self.known,
             "needs_talk": answer.needs,
             "uses_talk": answer.uses,
             "sentence": self.sentence,
@@ -159,25 +159,33 @@ class Talk:
 
 
 def talk(
-    config: RunConfig, out: Path, seeds: int = 3, env_steps: int = ENV_STEPS, watch: Watch | None = None
+    config: RunConfig,
+    out: Path,
+    seeds: int = 3,
+    env_steps: int = ENV_STEPS,
+    watch: Watch | None = None,
+    known: Path | None = None,
 ) -> Talk | None:
     """Train what is missing under `out`, play it, and write `report.html`, `report.md` and `summary.json` there.
 
-    config: of the talking learner. Returns None where the watcher's stop ended it early. Raises UserError for fewer
-    than two seeds, a single agent, a preset whose agents cannot talk, or a folder that holds something else.
+    config: of the talking learner. known: a file of silent and told learners, which then are not trained. Returns None
+    where the watcher's stop ended it early. Raises UserError for fewer than two seeds, a single agent, a preset whose
+    agents cannot talk, a file without those learners, or a folder that holds something else.
     """
     watch = watch or Watch()
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
-    runs = plan(_talking(config, seeds, env_steps), out)
-    asked = {"config": configuration.to_dict(runs[1].config)}
+    config = talker(config, seeds, env_steps, env_steps // EVALUATIONS)
+    before = None if known is None else read(known, config)
+    runs = [run for run in plan(config, out) if before is None or run.name not in before.finals]
+    asked = {"config": configuration.to_dict(config)}
     claim_folder(out, "talk.json", asked, "study of talk", lambda held: "another study: choose another --out")
     refuse_other_settings(runs)
     watch.planned({run.name: _HEARD[run.name] for run in runs})
     if not train_missing(runs, watch):
         return None
     watch.say("playing with silenced, scrambled and late messages")
-    done = _read(out, runs)
+    done = _read(out, runs, before)
     page = _report(done)
     done = replace(done, report=page.write(out, "report"))
     (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
@@ -186,18 +194,8 @@ def talk(
 
 def plan(config: RunConfig, out: Path) -> list[Planned]:
     """Plan the three learners. The silent and the told one are as large as the talking one."""
-    wanted = _num_parameters(config)
-    runs: list[Planned] = []
-    for name in LEARNERS:
-        network: dict[str, Any] = {"communication": _KINDS[name]}
-        changes: dict[str, Any] = {"network": network}
-        if name != TALKING:
-            network |= {"parameters": wanted, "gate": False, "word_price": 0.0}  # what only symbols have
-            if getattr(config.algorithm, "critic", None) == "told":
-                changes["critic"] = "central"  # a teacher that is told teaches to talk, not to do without
-        changed = configuration.from_dict({"algorithm": changes}, config)
-        runs.append(Planned(name, changed, out / name))
-    return runs
+    parameters = num_parameters(config)
+    return [Planned(name, hears_by(_KINDS[name], config, parameters), out / name) for name in LEARNERS]
 
 
 def answer(
@@ -211,43 +209,16 @@ def answer(
     return Answer(worth, used, random, needs, used.low > MATTERS * max(worth.point, 0.0))
 
 
-def _talking(config: RunConfig, seeds: int, env_steps: int) -> RunConfig:
-    """The settings of the talking learner. Raises UserError for what cannot talk."""
-    network = getattr(config.algorithm, "network", None)
-    if network is None:
-        raise UserError(
-            f"--preset {config.preset} has a network of its own: name one whose messages can be chosen"
-        )
-    env = tasks.find(config.task).make(config.env)
-    if env.num_agents < 2:
-        raise UserError(f"{config.task} has a single agent: nobody is there to talk to")
-    changes = {
-        "num_seeds": seeds,
-        "algorithm": {"network": {"communication": _KINDS[TALKING]}},
-        "training": {"env_steps": env_steps},
-        "evaluation": {"interval": max(env_steps // EVALUATIONS, 1)},
-    }
-    return configuration.from_dict(changes, config)
-
-
-def _num_parameters(config: RunConfig) -> int:
-    env = tasks.find(config.task).make(config.env)
-    draws = isinstance(config.algorithm, PpoConfig)
-    actions = (distribution(env).actions if draws else choices(env)).size
-    network = matched(env, config.algorithm.network, actions)  # pyright: ignore[reportAttributeAccessIssue] checked
-    return acting_parameters(env, network, actions)
-
-
-def _read(out: Path, runs: Sequence[Planned]) -> Talk:
-    """Play the finished learners."""
+def _read(out: Path, runs: Sequence[Planned], known: Known | None) -> Talk:
+    """Play the finished learners; those that are known were played before."""
     for run in runs:
         because = why_diverged(run.folder)
         if because is not None:
             raise UserError(f"there is no answer: the {run.name} learner {because}")
-    config = runs[LEARNERS.index(TALKING)].config
+    [(config, talking)] = [(run.config, run.folder) for run in runs if run.name == TALKING]
     episodes = config.evaluation.final_episodes
-    greedy = {run.name: _played(run.folder, episodes) for run in runs}
-    talking = runs[LEARNERS.index(TALKING)].folder
+    found = {run.name: _played(run.folder, episodes) for run in runs} | dict(known.finals if known else {})
+    greedy = {name: found[name] for name in LEARNERS}
     caught = {name: _played(talking, episodes, how) if how else greedy[TALKING] for name, how in PLAYED.items()}
     every = {**greedy, **{f"{TALKING}, {name}": values for name, values in caught.items() if name != SENT}}
     shown = tasks.find(config.task).shown(list(greedy[TALKING]))
@@ -260,10 +231,10 @@ def _read(out: Path, runs: Sequence[Planned]) -> Talk:
     played = {name: values[HEADLINE] for name, values in caught.items()}
     unscripted = scoring.play("random", episodes, lambda _: config.env, task=config.task)
     random = float(unscripted[HEADLINE].mean())
-    parameters = {run.name: _num_parameters(run.config) for run in runs}
+    parameters = {run.name: num_parameters(run.config) for run in runs} | dict(known.parameters if known else {})
     judged = answer(returns, played, random)
-    made = made_by(run.folder for run in runs)
-    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made)
+    made, known_from = made_by(run.folder for run in runs), known.says if known else ""
+    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made, known_from)
 
 
 def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArray[np.float64]]:
@@ -286,7 +257,8 @@ def _report(done: Talk) -> Page:
         f"{config.preset} on {done.task.name}: {config.training.env_steps:,} environment steps a seed, "
         f"{config.num_seeds} seeds from {config.seed}. Return of {config.evaluation.final_episodes} fixed episodes, "
         f"greedy, last parameters; mean over seeds and its 95 % bootstrap interval. Random agents: "
-        f"{done.answer.random:.2f}.",
+        f"{done.answer.random:.2f}."
+        + (f" Silent and told agents are those of {done.known}." if done.known else ""),
     )
     page.table(
         ("messages", "return per agent", "every seed"),
@@ -327,7 +299,11 @@ def _report(done: Talk) -> Page:
 def _command(config: RunConfig) -> str:
     """Write what repeats the study: the flags, and the settings of the task that are not as usual."""
     usual = configuration.on_task(configuration.preset(config.preset), config.task).env
-    words = [f"gacrl talk{tasks.flag(config.task)}", f"--preset {config.preset}", f"--seeds {config.num_seeds}"]
+    words = [
+        f"gacrl talk{tasks.flag(config.task, as_given=True)}",
+        f"--preset {config.preset}",
+        f"--seeds {config.num_seeds}",
+    ]
     words += [f"--seed {config.seed}", f"--env-steps {config.training.env_steps}"]
     for name, value in vars(config.env).items():
         flag = name.replace("_", "-")

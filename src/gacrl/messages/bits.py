@@ -2,9 +2,31 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
+import jax
 import numpy as np
 
+from gacrl.config.algorithms import NetworkConfig
+from gacrl.envs.environment import Environment
 from gacrl.evaluation.episodes import Episode
+from gacrl.networks.agent import AgentNetwork, words_said
+from gacrl.networks.communication import kind_of
+
+
+def bits_sent(env: Environment, config: NetworkConfig) -> float | None:
+    """Count the bits that an agent sends in a step of greedy play, all rounds together; None where it sends nothing.
+
+    A symbol has log2 of the vocabulary, with a gate of one more; any other number what its kind says.
+    """
+    network = eqx.filter_eval_shape(AgentNetwork, env, config, 1, jax.random.key(0))
+    said = words_said(network, env)
+    if said is None:
+        return None
+    rounds, _, numbers = said
+    kind = kind_of(config)
+    if kind.sends_symbols:
+        return rounds * float(np.log2(numbers + config.gate))
+    return rounds * numbers * kind.bits_of_number
 
 
 def bits_used(episodes: Sequence[Episode]) -> float | None:

@@ -42,6 +42,8 @@ class Own:
     """Those that stand where none are said."""
     source: Path | None = None
     """The file that it came from."""
+    given: Path | None = None
+    """That file as it was named."""
     digest: str | None = None
     """SHA-256 of that file."""
 
@@ -94,13 +96,17 @@ def ours(settings: Any) -> tuple[str, Any] | None:
     return name, kinds[name](**{field.name: getattr(settings, field.name) for field in fields(kinds[name])})
 
 
-def flag(name: str) -> str:
-    """What a command needs besides to find this task again: nothing for the default one."""
+def flag(name: str, as_given: bool = False) -> str:
+    """What a command needs besides to find this task again: nothing for the default one.
+
+    as_given: with its file as it was named, for a page that others read.
+    """
     own = _OWN.get(name)
     if own is not None and ":" in name:
         return f" --env {shlex.quote(name)}"
     if own is not None:
-        return " --env " + shlex.quote(f"{own.source or 'FILE.py'}:{name}")
+        source = own.given if as_given else own.source
+        return " --env " + shlex.quote(f"{source or 'FILE.py'}:{name}")
     return "" if name == DEFAULT else f" --env {name}"
 
 

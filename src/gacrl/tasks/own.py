@@ -72,7 +72,7 @@ def _by_name(name: str) -> str:
     with blamed(source):
         thing = _load(source, attribute)
         own = _with_plain_numbers(_record(thing, attribute))
-    own = replace(own, source=source, digest=hashlib.sha256(source.read_bytes()).hexdigest())
+    own = replace(own, source=source, given=Path(path), digest=hashlib.sha256(source.read_bytes()).hexdigest())
     with blamed(source):
         examine(own)
     tasks.bring(own)

@@ -61,6 +61,21 @@ class Team(NamedTuple):
     """(settings of the room, state, a fresh one, agents before, now) -> the state, newcomers as in the fresh one."""
 
 
+class Case(NamedTuple):
+    """A task as the study of talk has it (`gacrl talk`)."""
+
+    env_steps: int
+    """Of each learner."""
+    reached: str
+    """The metric that is to reach .9."""
+    settings: Mapping[str, Any] = MappingProxyType({})
+    """What is set otherwise than usual."""
+    utterances: Mapping[str, Any] | None = None
+    """What is set where words are actions; None: the task has no such words."""
+    moves_tell: bool = False
+    """Silent agents see something that others did: silent ones with a memory are trained as well."""
+
+
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
     """Nothing about the task is a number that could change between steps."""
     return ()
@@ -135,10 +150,15 @@ class Task(NamedTuple):
     comparable: tuple[str, ...] | None = None
     """Attributes of the settings that must be equal in one table; None: all."""
     words: Words = Words()
+    uttered: Callable[[Any, Any], tuple[Any, Any]] | None = None
+    """(Environment, policy that sends symbols) -> the environment in which words are actions, and the policy that
+    utters its symbols there; None: the task has no such actions."""
     actions: Callable[[Settings], Sequence[str]] = unnamed
     """What each action does, by index: it stands beside an exported policy."""
     parts: Mapping[str, Part] = MappingProxyType({})
     """Parts of an ablation that this task alone has."""
+    cases: Mapping[str, Case] = MappingProxyType({})
+    """What the study of talk makes of it, by the names that it has there."""
     summary: str = ""
     """One line on what must be done, for `gacrl tasks`."""
 

@@ -73,6 +73,8 @@ class Communication(eqx.Module):
     """Whether what is played is one symbol of `vocabulary` for each round."""
     heard_late: ClassVar[bool] = False
     """Whether what is said at a step is heard at the next one."""
+    bits_of_number: ClassVar[float] = 32.0
+    """Bits of each number that is sent in play, where these are no symbols."""
 
     def empty_inbox(self, num_agents: int) -> Any:
         """What nobody has said anything into; () for a kind that is heard in the step in which it is said."""

@@ -22,6 +22,7 @@ class Dial(Communication):
     """
 
     heard_late: ClassVar[bool] = True
+    bits_of_number: ClassVar[float] = 1.0
 
     encode: Linear
     decode: Linear

@@ -15,7 +15,7 @@ from gacrl.tasks.spread.scripted import local, oracle, silent
 from gacrl.tasks.spread.settings import COMPARABLE, METRICS, SCOUTS_METRICS, ScoutsSettings, SpreadSettings
 from gacrl.tasks.spread.team import TEAM
 from gacrl.tasks.spread.world import world
-from gacrl.tasks.task import Part, Task, Words
+from gacrl.tasks.task import Case, Part, Task, Words
 
 
 def make(settings: SpreadSettings) -> Spread:
@@ -103,5 +103,6 @@ SCOUTS = TASK._replace(
     anchors=Path(__file__).with_name("anchors") / "scouts.json",
     scene=scouts.scene,
     comparable=(*COMPARABLE, "num_blind"),
+    cases={"scouts": Case(75_000, "coverage_final_0.1", moves_tell=True)},
     summary="spread where one agent sees no landmarks: the others must tell it where to go",
 )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from jaxtyping import Array, Float
 
-from gacrl.tasks.task import Task, Words
+from gacrl.tasks.task import Case, Task, Words
 from gacrl.tasks.traffic.environment import TrafficJunction, TrafficParams
 from gacrl.tasks.traffic.scene import scene
 from gacrl.tasks.traffic.scripted import gas, yielder
@@ -46,5 +46,6 @@ TASK = Task(
     ragged=ragged,
     words=Words(agent="car"),
     actions=lambda settings: ("drive", "brake"),
+    cases={"traffic_junction": Case(800_000, "success", moves_tell=True)},
     summary="cars must cross junctions without a crash, and see next to nothing of each other (IC3Net)",
 )

@@ -1,0 +1,157 @@
+"""`gacrl talk` without a task: every talking task with every kind of communication, each cell a run folder.
+
+A cell that is done is not run again, whichever tasks and kinds are asked for: the report shows all that are there.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gacrl import tasks
+from gacrl.config import files as configuration
+from gacrl.config.checks import require, unknown
+from gacrl.config.run import RunConfig
+from gacrl.errors import UserError
+from gacrl.experiments.study import Planned, Watch, claim_folder, refuse_other_settings, train_missing
+from gacrl.experiments.talking import kinds as talkers
+from gacrl.experiments.talking import report
+from gacrl.experiments.talking.cells import Played, catch, played
+from gacrl.experiments.talking.trials import FACTORS, tried, tuned
+from gacrl.tasks.task import Case
+from gacrl.training.recorder import RunFolder
+
+EPISODES, CLOSING_EPISODES = 320, 512
+"""Of the evaluations along the way, and of the closing one."""
+
+
+class Cell(NamedTuple):
+    """A learner of a case."""
+
+    case: str
+    kind: str
+    run: Planned
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, as far as it has come."""
+
+    out: Path
+    report: Path
+    command: str
+    cases: Mapping[str, Played]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all of it as plain data."""
+        cases = {name: found.to_dict() for name, found in self.cases.items()}
+        return {"out": str(self.out), "report": str(self.report), "command": self.command, "cases": cases}
+
+
+def all_cases() -> dict[str, tuple[str, Case]]:
+    """List the cases of the study by name, each with its task."""
+    return {name: (task, case) for task in tasks.names() for name, case in tasks.find(task).cases.items()}
+
+
+def study(
+    config: RunConfig,
+    out: Path,
+    seeds: int = 3,
+    scale: float = 1.0,
+    trials: int = 1,
+    cases: Sequence[str] = (),
+    kinds: Sequence[str] = (),
+    watch: Watch | None = None,
+) -> Study | None:
+    """Train and play what is missing under `out`, and write `report.html`, `report.md` and `summary.json` there.
+
+    config: of the learner, whatever its task is. scale: of the steps. trials: learning rates that every learner may try
+    on seeds of their own; 1: as the presets are. cases, kinds: those to train; none: all. Silent and told learners are
+    always among them. Returns None where the watcher's stop ended it early. Raises UserError for
+    fewer than two seeds, a case or kind there is not, a preset whose agents cannot talk, or a folder that holds
+    something else.
+    """
+    watch, out = watch or Watch(), out.absolute()
+    if seeds < 2:
+        raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
+    require(0 < scale <= 100, f"--scale must be above 0 and at most 100, not {scale:g}")
+    require(1 <= trials <= len(FACTORS), f"--trials must be between 1 and {len(FACTORS)}, not {trials}")
+    wanted = {*_known("task of the study", cases, list(all_cases()))}
+    hearing = {*_known("kind of communication", kinds, list(talkers.kinds())), talkers.NONE, talkers.TOLD}
+    cells = plan(config, out, seeds, scale)
+    asked = [cell for cell in cells if cell.case in wanted and cell.kind in hearing]
+    marker = {"config": configuration.to_dict(replace(config, num_seeds=seeds)), "scale": scale, "trials": trials}
+    claim_folder(out, "study.json", marker, "study of talk", lambda held: "another study: choose another --out")
+    attempts = {cell.run.name: tried(cell.run, trials) if trials > 1 else [] for cell in cells}
+    if trials == 1:  # else what a learner's rate is to be is not known yet
+        refuse_other_settings([cell.run for cell in cells])
+    says = {kind: found.says for kind, found in talkers.kinds().items()}
+    watch.planned({run.name: says[cell.kind] for cell in asked for run in (*attempts[cell.run.name], cell.run)})
+    for cell in asked:
+        if not _train(cell.run, attempts[cell.run.name], watch):
+            return None
+    watch.say("writing the report")
+    ended = [cell for cell in cells if cell.run.finished]
+    found = {
+        name: played(
+            name, *all_cases()[name], {cell.kind: _as_it_was(cell.run) for cell in ended if cell.case == name}
+        )
+        for name in dict.fromkeys(cell.case for cell in ended)
+    }
+    command = _command(config, seeds, scale, trials, found)
+    done = Study(out, report.page(found, config, seeds, trials, command).write(out, "report"), command, found)
+    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=1) + "\n", encoding="utf-8")
+    return done
+
+
+def _train(run: Planned, trials: Sequence[Planned], watch: Watch) -> bool:
+    """Train a learner, after its trials, and catch its messages; False where the watcher stopped it."""
+    refuse_other_settings(trials)
+    if not train_missing(trials, watch):
+        return False
+    run = tuned(run, trials) if trials else run
+    refuse_other_settings([run])
+    if not train_missing([run], watch):
+        return False
+    catch(run, watch.say)
+    return True
+
+
+def _as_it_was(run: Planned) -> Planned:
+    """Return a finished run with the settings that it was trained with: its trials may have chosen another rate."""
+    return replace(run, config=RunFolder.open(run.folder).config())
+
+
+def plan(config: RunConfig, out: Path, seeds: int, scale: float) -> list[Cell]:
+    """Plan every cell that there can be. Raises UserError for a preset whose agents cannot talk."""
+    evaluation = replace(config.evaluation, num_episodes=EPISODES, final_episodes=CLOSING_EPISODES)
+    config = replace(config, evaluation=evaluation)
+    cells: list[Cell] = []
+    for name, (task, case) in all_cases().items():
+        shared = talkers.base(configuration.on_task(config, task), case, seeds, scale)
+        for kind, learner in talkers.kinds().items():
+            settings = learner.settings(shared)
+            if settings is not None:
+                cells.append(Cell(name, kind, Planned(f"{name}, {kind}", settings, out / name / kind)))
+    return cells
+
+
+def _known(what: str, asked: Sequence[str], known: list[str]) -> list[str]:
+    """Return what is asked for, or all. Raises UserError for a name there is not."""
+    for name in asked:
+        if name not in known:
+            raise UserError(unknown(what, name, known))
+    return list(asked) or known
+
+
+def _command(config: RunConfig, seeds: int, scale: float, trials: int, cases: Mapping[str, Played]) -> str:
+    """Write what makes these cells anew."""
+    words = [f"gacrl talk --preset {config.preset} --seeds {seeds} --seed {config.seed}"]
+    words += [f"--scale {scale:g}"] if scale != 1 else []
+    words += [f"--trials {trials}"] if trials > 1 else []
+    found = {kind for case in cases.values() for kind in case.learners}
+    some_kinds = [kind for kind in talkers.kinds() if kind in found]
+    words += [f"--tasks {' '.join(cases)}"] if len(cases) < len(all_cases()) else []
+    words += [f"--kinds {' '.join(some_kinds)}"] if len(some_kinds) < len(talkers.kinds()) else []
+    return " ".join(words)

@@ -1,0 +1,71 @@
+"""Symbols sent as utterance actions: they arrive a step late, as the intervention that delays them says."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import drawn
+
+from gacrl import tasks
+from gacrl.adapters import mpe2
+from gacrl.config.algorithms import NetworkConfig
+from gacrl.errors import ConfigError
+from gacrl.evaluation.evaluate import evaluate
+from gacrl.messages.interventions import delay, silence
+from gacrl.networks.agent import AgentNetwork
+from gacrl.tasks.navigation.environment import make
+from gacrl.tasks.navigation.uttered import uttered
+from gacrl.types import Decision, Memory, Observation, Policy, PRNGKey
+
+pytestmark = pytest.mark.usefixtures("quick_start")
+
+KEY = jax.random.key(3)
+NETWORK = NetworkConfig(torso="graph", width=16, communication="discrete", vocabulary=10, second_look=True)
+
+
+def listeners(config: NetworkConfig) -> Policy:
+    """Agents with drawn weights, which say one thing here and another there."""
+    network = drawn(AgentNetwork, REFERENCE, config, 5)
+
+    def policy(memory: Memory, observation: Observation, key: PRNGKey):
+        output, _ = network(observation)
+        return Decision(output.head.argmax(-1), output.messages, output.adjacency), memory
+
+    return policy
+
+
+REFERENCE = make(tasks.default_settings("reference"))
+
+
+def test_what_is_uttered_is_heard_as_what_is_a_step_late():
+    policy, params = listeners(NETWORK), REFERENCE.default_params()
+    env, speaking = uttered(REFERENCE, policy)
+    late, mute, spoken = (
+        evaluate(one, acting, (), params, KEY, 16, happens)["return_agent_mean"]
+        for one, acting, happens in (
+            (REFERENCE, policy, delay(1)),
+            (REFERENCE, policy, silence()),
+            (env, speaking, None),
+        )
+    )
+    np.testing.assert_allclose(spoken, late, rtol=1e-5)
+    assert not np.allclose(spoken, mute, rtol=1e-2), "these agents listen"
+    theirs = mpe2.evaluate(env, speaking, (), KEY, 64)
+    here = evaluate(env, speaking, (), params, KEY, 64)["return_agent_mean"]
+    apart = np.hypot(np.std(here), theirs["return_agent_mean"].std()) / 8
+    assert abs(np.mean(here) - theirs["return_agent_mean"].mean()) < 4 * apart, "as in MPE2, on its own starts"
+
+
+def test_what_cannot_be_uttered_is_named():
+    state, seen = REFERENCE.reset(KEY)
+    _, speaking = uttered(REFERENCE, listeners(replace(NETWORK, rounds=2)))
+    with pytest.raises(ConfigError, match="an utterance is one of 10 words a step, and the agents say 2 of 10"):
+        speaking((), seen, KEY)
+    _, mute = uttered(REFERENCE, listeners(replace(NETWORK, communication="none")))
+    with pytest.raises(ConfigError, match="the agents say nothing that could be uttered"):
+        mute((), seen, KEY)
+    with pytest.raises(ConfigError, match="could be"):
+        uttered(make(tasks.default_settings("colours")), listeners(NETWORK))
+    assert jnp.all(state.words == -1)
