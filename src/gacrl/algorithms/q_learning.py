@@ -184,6 +184,7 @@ def make(
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
         replay=lambda learner: learner.replay,
         batch_steps=config.batch_size * q.window,
+        library_sums=config.network.recurrent,
     )
 
 

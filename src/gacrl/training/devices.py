@@ -18,6 +18,7 @@ from jaxtyping import PyTree
 
 from gacrl.algorithms.shared import ENVS
 from gacrl.errors import UserError
+from gacrl.training import accelerator
 
 _CACHE_BYTES = 512 * 2**20
 """Bound of the compilation cache; the oldest programs go first."""
@@ -35,11 +36,13 @@ def prepare_jax(num_seeds: int = 1) -> None:
     Compiled programs are kept in the user's cache folder, so that a second start is quick; and most are compiled
     quickly, not for speed (`compiler_options`).
 
-    What the user has set already stays, and once JAX has started its devices stay as they are.
+    What the user has set already stays, and once JAX has started its devices stay as they are. Raises UserError where
+    the user asks for a GPU that JAX was installed without.
     """
     os.environ.setdefault("NPROC", "1")  # the size of XLA's thread pool, where there is one device
-    if KNOWN_XLA:
-        os.environ.setdefault("XLA_FLAGS", _QUICKLY)
+    chosen = accelerator.flags(_QUICKLY if KNOWN_XLA else None)
+    if chosen is not None:
+        os.environ.setdefault("XLA_FLAGS", chosen)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(RuntimeError):  # JAX has started
         if jax.config.jax_num_cpu_devices < 0:  # pyright: ignore[reportAttributeAccessIssue]
@@ -53,18 +56,21 @@ def prepare_jax(num_seeds: int = 1) -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def compiler_options(for_speed: bool = True) -> dict[str, Any]:
+def compiler_options(for_speed: bool = True, library_sums: bool = False) -> dict[str, Any]:
     """Options for a training program, of many small pieces, on the versions that they were measured with.
 
     XLA hands matrix products and, from 0.10 on, also sums to a kernel library; for sums of this size the call
-    costs more than the sum (0.57 instead of 0.67 ms for a step of the paper's schedule).
+    costs more than the sum (0.57 instead of 0.67 ms for a step of the paper's schedule). Along windows of many steps it
+    is the other way round (docs/design.md): there `library_sums` leaves them to the library.
 
     for_speed: optimised as XLA does by itself, not as quickly compiled as all else is. Whoever sets XLA_FLAGS has the
     choice of both.
     """
     if not (KNOWN_XLA and jax.default_backend() == "cpu"):
         return {}
-    options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
+    options: dict[str, Any] = {}
+    if not library_sums:
+        options["xla_cpu_experimental_ynn_fusion_type"] = "LIBRARY_FUSION_TYPE_DOT"
     if for_speed and os.environ.get("XLA_FLAGS") == _QUICKLY:
         options |= {"xla_cpu_use_fusion_emitters": True, "xla_backend_optimization_level": 3}
     return options
