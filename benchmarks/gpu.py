@@ -224,6 +224,7 @@ def main() -> None:
     parser.add_argument("--jaxmarl", help="a checkout of the JaxMARL repository")
     parser.add_argument("--peer-python", default=sys.executable, help="an interpreter that has jaxmarl")
     parser.add_argument("--seconds", type=float, default=300.0, help="after which nothing more is begun")
+    parser.add_argument("--only", default="", help="only parts whose names have this in them, and no start")
     parser.add_argument("--small", action="store_true", help="tiny sizes: a try")
     parser.add_argument("--json", action="store_true", help="end with everything in one line")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
@@ -235,9 +236,12 @@ def main() -> None:
     begun = time.perf_counter()
     found: dict[str, Any] = {"machine": measure(["device"], sys.executable)}
     print(told("machine", found["machine"]), flush=True)
-    found["start"] = starts(asked.small)
-    print(told("gacrl train, typed to prompt", found["start"]), flush=True)
+    if not asked.only:
+        found["start"] = starts(asked.small)
+        print(told("gacrl train, typed to prompt", found["start"]), flush=True)
     for name, words in parts(asked):
+        if asked.only.lower() not in name.lower():
+            continue
         if time.perf_counter() - begun > asked.seconds:
             print(f"{name:44} left out: {asked.seconds:.0f} s are over", flush=True)
             continue
