@@ -4,9 +4,9 @@
 
 Both train on MPE's simple_spread of 25 steps with five actions, theirs PettingZoo's, with BenchMARL's defaults: 256
 wide, two layers, batches of 6,000 steps, 45 epochs of 15 minibatches, its learning rate, discount and clipping. The
-sides take turns, each training a process of its own on one thread. Steps a second are by CPU time of this process, without
-compilation; the score is of 320 greedy episodes: the mean return of an agent in MPE2's convention (random -26.2, the
-scripted oracle -7.0), and the share of landmarks with an agent within 0.1 at the end.
+sides take turns, each training a process of its own on one thread. Steps a second are by CPU time of that process,
+without compilation. The score is of 320 greedy episodes: the mean return of an agent in MPE2's convention (random
+-26.2, the scripted oracle -7.0), and the share of landmarks with an agent within 0.1 at the end.
 
 --benchmarl: a checkout of its repository, whose source is run (its commit is told) in place of the installed package.
 --python: an interpreter that has it; by default an environment that is made for the purpose. EPyMARL is left out:
