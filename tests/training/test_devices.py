@@ -1,11 +1,14 @@
 """How JAX is set up: quickly compiled but for training, and only where the user has not chosen."""
 
+import errno
 import os
+import tempfile
+from pathlib import Path
 
 import jax
 import pytest
 
-from gacrl.training import devices
+from gacrl.training import devices, program_cache
 
 KNOWN = pytest.mark.skipif(not devices.KNOWN_XLA, reason="another version compiles as it likes")
 
@@ -35,3 +38,17 @@ def test_whoever_sets_the_flags_has_the_choice(unset: pytest.MonkeyPatch):
     devices.prepare_jax()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
     assert devices.compiler_options() == devices.compiler_options(for_speed=False)
+
+
+def test_a_cache_that_cannot_be_written_is_left_out_and_said(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert program_cache.make_folder() == tmp_path / "gacrl" / "jax" and capsys.readouterr().err == ""
+    monkeypatch.setattr(tempfile, "TemporaryFile", full_disk)
+    assert program_cache.make_folder() is None
+    assert capsys.readouterr().err == (
+        f"gacrl: {tmp_path}/gacrl/jax keeps no compiled programs: No space left on device; each start compiles anew\n"
+    )
+
+
+def full_disk(dir: Path):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -6,7 +6,6 @@ import os
 from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,10 +17,8 @@ from jaxtyping import PyTree
 
 from gacrl.algorithms.shared import ENVS
 from gacrl.errors import UserError
-from gacrl.training import accelerator
+from gacrl.training import accelerator, program_cache
 
-_CACHE_BYTES = 512 * 2**20
-"""Bound of the compilation cache; the oldest programs go first."""
 KNOWN_XLA = jax.__version__.startswith("0.10.")
 """Whether XLA's flags and options below are known to this version."""
 _QUICKLY = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=2"
@@ -47,13 +44,7 @@ def prepare_jax(num_seeds: int = 1) -> None:
     with contextlib.suppress(RuntimeError):  # JAX has started
         if jax.config.jax_num_cpu_devices < 0:  # pyright: ignore[reportAttributeAccessIssue]
             jax.config.update("jax_num_cpu_devices", min(cores, num_seeds))
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        with contextlib.suppress(OSError):  # no place for a cache: work without one
-            (caches / "gacrl" / "jax").mkdir(parents=True, exist_ok=True)
-            jax.config.update("jax_compilation_cache_dir", str(caches / "gacrl" / "jax"))
-            jax.config.update("jax_compilation_cache_max_size", _CACHE_BYTES)
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    program_cache.keep()
 
 
 def compiler_options(for_speed: bool = True, library_sums: bool = False) -> dict[str, Any]:
