@@ -28,7 +28,9 @@ def test_training_is_compiled_for_speed_and_all_else_quickly(unset: pytest.Monke
     fast, quick = devices.compiler_options(), devices.compiler_options(for_speed=False)
     assert fast["xla_cpu_use_fusion_emitters"] is True and fast["xla_backend_optimization_level"] == 3
     assert set(fast) - set(quick) == {"xla_cpu_use_fusion_emitters", "xla_backend_optimization_level"}
-    for options in (fast, quick):
+    library = devices.compiler_options(library_sums=True)
+    assert set(fast) - set(library) == {"xla_cpu_experimental_ynn_fusion_type"}, "XLA's own choice"
+    for options in (fast, quick, library):
         assert jax.jit(lambda x: x + 1, compiler_options=options)(1) == 2, "XLA knows them"
 
 

@@ -184,7 +184,7 @@ def make(
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
         replay=lambda learner: learner.replay,
         batch_steps=config.batch_size * q.window,
-        library_sums=config.network.recurrent,
+        library_sums=config.network.recurrent and not network.agent.communication.heard_late,
     )
 
 
