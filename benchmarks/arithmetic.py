@@ -1,10 +1,10 @@
 """How far training is from the arithmetic limit of the machine: counted products against measured ones.
 
-    python benchmarks/arithmetic.py [--preset gacrl …] [--shapes shipped] [--num-envs N] [--core 0] [--json]
+    python benchmarks/arithmetic.py [--preset gacrl …] [--shapes shipped] [--num-envs N] [--core 0] [--each] [--json]
 
 For each preset: the matrix products of one update and the acting before it, counted from the program's jaxpr; the time
 that an update takes; and two limits. `large`: their FLOPs at the speed of a 512 × 512 product. `own`: each of them
-measured alone, at its own shape, and added up. CPU time of one thread on one core.
+measured alone, at its own shape, and added up; --each tells each. CPU time of one thread on one core.
 """
 
 import argparse
@@ -21,7 +21,7 @@ SECONDS = 2.0
 """Of a measurement, about."""
 
 
-def measure(preset: str, shapes: str, num_envs: int | None) -> dict[str, float]:
+def measure(preset: str, shapes: str, num_envs: int | None, each: bool = False) -> dict[str, float]:
     """Milliseconds of an update, its MFLOP, and the milliseconds of the two limits."""
     import jax
     import jax.numpy as jnp
@@ -38,7 +38,12 @@ def measure(preset: str, shapes: str, num_envs: int | None) -> dict[str, float]:
     one = jax.eval_shape(trainer.init_member, jax.random.key(0), trainer.algorithm.hyper)
     found = products(jax.make_jaxpr(trainer.chunk_of_one)(one, jnp.int32(1)).jaxpr)
     large = Product((512, 512), (512, 512), (((1,), (0,)), ((), ())))
-    own = sum(count * alone(product) for product, count in found.items())
+    taken_alone = {product: count * alone(product) for product, count in found.items()}
+    for product, seconds in sorted(taken_alone.items(), key=lambda item: -item[1]) if each else ():
+        speed = found[product] * product.flops / seconds / 1e9
+        factors = f"{product.left} {product.right} over {product.dimensions[0]}"
+        print(f"{preset}: {found[product]:5} times {factors:60} {speed:4.0f} GFLOP/s {1e3 * seconds:6.2f} ms")
+    own = sum(taken_alone.values())
     return {
         "steps_per_second": run.steps_per_update / taken,
         "milliseconds": 1e3 * taken,
@@ -59,6 +64,7 @@ def main() -> None:
     )
     parser.add_argument("--num-envs", type=int, help="instead of the preset's")
     parser.add_argument("--core", type=int, default=0)
+    parser.add_argument("--each", action="store_true", help="every product, and its speed alone")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     os.environ |= peers.ONE_THREAD
@@ -71,7 +77,7 @@ def main() -> None:
     print("| preset | steps/s | ms an update | MFLOP | at a large product's speed | each at its own |")
     print("| --- | --- | --- | --- | --- | --- |")
     for preset in asked.preset or PRESETS:
-        seen = table[preset] = measure(preset, asked.shapes, asked.num_envs)
+        seen = table[preset] = measure(preset, asked.shapes, asked.num_envs, asked.each)
         print(
             f"| {preset} | {seen['steps_per_second']:,.0f} | {seen['milliseconds']:.3g} | {seen['megaflop']:.3g} | "
             f"{seen['large'] / seen['milliseconds']:.0%} | {seen['own'] / seen['milliseconds']:.0%} |",

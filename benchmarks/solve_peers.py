@@ -98,24 +98,33 @@ class Until(peers.Callback):
         if time.time() < self.until:
             return
         print(json.dumps({"steps": self.experiment.total_frames}), flush=True)
-        import torch
-        from pettingzoo.mpe import simple_spread_v3
-        from tensordict import TensorDict
-        from torchrl.envs.utils import ExplorationType, set_exploration_type
-
-        def batch(seen: list[dict[str, Any]]) -> Any:
-            return torch.tensor(np.array([list(each.values()) for each in seen]))
-
-        envs = [simple_spread_v3.parallel_env(max_cycles=STEPS) for _ in range(EPISODES)]
-        seen = [env.reset(seed=number)[0] for number, env in enumerate(envs)]
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for _ in range(STEPS):
-                given = TensorDict({group: TensorDict({"observation": batch(seen)}, [EPISODES, 3])}, [EPISODES])
-                actions = self.experiment.policy(given)[group, "action"].tolist()
-                pairs = zip(envs, actions, strict=True)
-                seen = [env.step(dict(zip(env.agents, chosen, strict=True)))[0] for env, chosen in pairs]
-        print(json.dumps({"coverage": coverage(batch(seen))}), flush=True)
+        found = play_benchmarl(self.experiment.policy, group, EPISODES, STEPS)
+        print(json.dumps({"coverage": found["coverage"]}), flush=True)
         raise peers.Enough
+
+
+def play_benchmarl(policy: Any, group: str, episodes: int, steps: int) -> dict[str, float]:
+    """Greedy episodes of a policy of BenchMARL in PettingZoo's simple_spread: an agent's return, and coverage."""
+    import torch
+    from pettingzoo.mpe import simple_spread_v3
+    from tensordict import TensorDict
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    def batch(seen: list[dict[str, Any]]) -> Any:
+        return torch.tensor(np.array([list(each.values()) for each in seen]))
+
+    envs = [simple_spread_v3.parallel_env(max_cycles=steps) for _ in range(episodes)]
+    seen = [env.reset(seed=number)[0] for number, env in enumerate(envs)]
+    earned = 0.0
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(steps):
+            given = TensorDict({group: TensorDict({"observation": batch(seen)}, [episodes, 3])}, [episodes])
+            actions = policy(given)[group, "action"].tolist()
+            pairs = zip(envs, actions, strict=True)
+            after = [env.step(dict(zip(env.agents, chosen, strict=True))) for env, chosen in pairs]
+            seen = [it[0] for it in after]
+            earned += float(np.mean([list(it[1].values()) for it in after]))
+    return {"return": earned, "coverage": coverage(batch(seen))}
 
 
 def benchmarl(program: str, seed: int, until: float) -> None:

@@ -1,6 +1,6 @@
 """Training steps a second, beside JaxMARL and BenchMARL.
 
-    python benchmarks/training.py [--rounds 3] [--core 0] [--jaxmarl CHECKOUT] [--json]
+    python benchmarks/training.py [--rounds 3] [--core 0] [--jaxmarl CHECKOUT] [--only jaxmarl] [--json]
 
 A step is one environment step, with its share of the updates; compilation is not part of it. Three comparisons:
 
@@ -125,7 +125,7 @@ def benchmarl(algorithm: str) -> float:
     return sum(clock.frames[1:]) / (clock.times[-1] - clock.times[0])
 
 
-def compare(rounds: int, core: int, checkout: str | None) -> dict[str, dict[str, list[float]]]:
+def compare(rounds: int, core: int, checkout: str | None, only: str | None) -> dict[str, dict[str, list[float]]]:
     """How many times as fast as each peer, per algorithm and round."""
     us = peers.Side("ours", sys.executable, __file__, core)
     ratios: dict[str, dict[str, list[float]]] = {}
@@ -144,18 +144,19 @@ def compare(rounds: int, core: int, checkout: str | None) -> dict[str, dict[str,
         return True
 
     peer = None
-    if checkout is None:
+    if only == "benchmarl":
+        pass
+    elif checkout is None:
         print("no checkout of JaxMARL (--jaxmarl): ours alone, at its shapes", flush=True)
     elif python := peers.python_of("jaxmarl"):
         peer = peers.Side("jaxmarl", python, __file__, core)
-    for algorithm in ("ippo", "qmix"):
+    for algorithm in ("ippo", "qmix") if only != "benchmarl" else ():
         if not against("jaxmarl", peer, "jaxmarl", algorithm, checkout=checkout or "") and peer:
             peer.close()
             peer = peers.Side("jaxmarl", peers.python_of("jaxmarl") or "", __file__, core)
     if peer:
         peer.close()
-    print("epymarl is in no package index: it cannot be installed here, and is left out", flush=True)
-    python = peers.python_of("benchmarl")
+    python = peers.python_of("benchmarl") if only != "jaxmarl" else None
     for shapes, name, algorithms in (
         ("shipped", "benchmarl as shipped", ("ippo", "mappo", "qmix")),
         ("benchmarl", "benchmarl at its shapes", ("ippo", "mappo")),
@@ -173,6 +174,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3, help="turns of each side")
     parser.add_argument("--core", type=int, default=0, help="the core that all sides are pinned to")
     parser.add_argument("--jaxmarl", help="a checkout of the JaxMARL repository, for its baselines")
+    parser.add_argument("--only", choices=("jaxmarl", "benchmarl"), help="one peer alone")
     parser.add_argument(
         "--json", action="store_true", help="end with one line: {ratio: {peer: {algorithm: value}}}"
     )
@@ -182,7 +184,7 @@ def main() -> None:
         side = {"ours": ours, "jaxmarl": jaxmarl}.get(asked.serve)
         peers.serve((lambda **request: side(**request)()) if side else benchmarl)
         return
-    ratios = compare(asked.rounds, asked.core, asked.jaxmarl)
+    ratios = compare(asked.rounds, asked.core, asked.jaxmarl, asked.only)
     for name, found in ratios.items():
         for algorithm, values in found.items():
             print(f"{algorithm}: {peers.spread(values)} times as fast as {name}")

@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from gacrl.errors import full_memory
+from gacrl.errors import full_memory, missing_device
 
 
 @pytest.mark.parametrize(
@@ -34,3 +34,9 @@ from gacrl.errors import full_memory
 )
 def test_a_full_memory_is_known_by_its_words(error: Exception, said: str | None):
     assert full_memory(error) == said
+
+
+def test_a_device_that_is_not_there_is_known_by_its_words():
+    said = "Unable to initialize backend 'cuda': no supported devices found for platform CUDA"
+    assert missing_device(RuntimeError(f"{said}. (set JAX_PLATFORMS='' to choose one)")) == said
+    assert missing_device(RuntimeError("INTERNAL: something else")) is None

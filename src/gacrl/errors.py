@@ -5,6 +5,9 @@ import re
 _FULL = re.compile(r"out of memory[^\n]*|bad_alloc|RESOURCE_EXHAUSTED: ?([^\n]*)", re.IGNORECASE)
 """What JAX, XLA's CPU and GPU runtimes and C++ say of a memory that is full."""
 
+_MISSING = re.compile(r"Unable to initialize backend [^\n]*?(?= \(set JAX_PLATFORMS|\n|$)")
+"""What JAX says of a platform that was asked for and is not there."""
+
 
 class UserError(Exception):
     """Something the user asked for cannot be done."""
@@ -21,6 +24,12 @@ def full_memory(error: BaseException) -> str | None:
         return str(error).rstrip(" .") or "out of memory"
     found = _FULL.search(str(error)) if isinstance(error, RuntimeError) else None
     return None if found is None else (found[1] or found[0]).rstrip(" .")
+
+
+def missing_device(error: BaseException) -> str | None:
+    """The words of an error that is about a device that JAX cannot start; None for any other error."""
+    found = _MISSING.search(str(error)) if isinstance(error, RuntimeError) else None
+    return None if found is None else found[0].rstrip(" .")
 
 
 class ConfigError(UserError, ValueError):

@@ -43,3 +43,5 @@ class Algorithm(NamedTuple):
     """Whether the environments of a seed may be spread over several devices."""
     compiled_for_speed: bool = True
     """Whether its program is optimised as far as the compiler can, or compiled quickly where that runs as fast."""
+    library_sums: bool = False
+    """Whether the compiler hands sums, and not products alone, to its kernel library: it pays along long windows."""

@@ -185,6 +185,7 @@ def make(
         learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
         replay=lambda learner: learner.replay,
         batch_steps=config.batch_size * q.window,
+        library_sums=config.network.recurrent and not network.agent.communication.heard_late,
     )
 
 
@@ -309,13 +310,43 @@ class Pair(NamedTuple):
     temperature: Float[Array, ""] | float
 
 
+class Looks(NamedTuple):
+    """What networks make of windows: what they put out, and their memory after each step."""
+
+    online: tuple[AgentOutput, Memory]
+    """Of the network that learns from rewards; without a memory, of the steps that are learned from."""
+    theirs: tuple[AgentOutput, Memory] | None
+    """Of the target network; None without a memory."""
+    pupil: AgentOutput | None
+    """Of a teacher's pupils; None where nobody is taught."""
+
+
 def along(
-    network: AgentNetwork, steps: Transition, memory: Memory, key: PRNGKey | None, temperature: Array | float
+    network: AgentNetwork, steps: Transition, memory: Memory, keys: Array | None, temperature: Array | float
 ) -> tuple[AgentOutput, Memory]:
-    """Along a window: what is put out, and the memory after each step."""
-    keys = None if key is None else jax.random.split(key, steps.first.shape[0])
-    begins = beginnings(steps.first, steps.left)
-    return unroll(network, steps.observation, begins, memory, keys, temperature)
+    """Along windows [W, B, …]; keys and memory [B, …]."""
+    length = steps.first.shape[0]
+    drawn = None if keys is None else jax.vmap(lambda key: jax.random.split(key, length), 0, 1)(keys)
+    begins = jax.vmap(beginnings, 1, 1)(steps.first, steps.left)
+    return unroll(network, steps.observation, begins, memory, drawn, temperature)
+
+
+def look(q: Setup, pair: Pair, steps: Experience, keys: Array) -> Looks:
+    """Unroll the networks along windows [W, B, …]; keys [B]."""
+    network, heard, learned = pair.network, steps.transition, q.config.sequence_length
+    seen = heard if network.teacher is None else as_told(heard)
+    memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
+    if q.config.augment:  # what is remembered is not turned
+        memory = jax.tree.map(jnp.zeros_like, memory)
+    pupil, now = None, jax.tree.map(lambda leaf: leaf[:learned], (seen, heard))
+    if network.teacher is not None:
+        pupil = along(network.agent, now[1], memory, keys, pair.temperature)[0]
+    if q.forgetful:
+        return Looks(along(network.judge, now[0], (), keys, pair.temperature), None, pupil)
+    # What a teacher remembers is not kept.
+    before = memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
+    online = along(network.judge, seen, before, keys, pair.temperature)
+    return Looks(online, along(pair.target.judge, seen, before, None, pair.temperature), pupil)
 
 
 def best_value(
@@ -358,40 +389,29 @@ def following(
 
 
 def window_loss(
-    q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, steps: Experience, key: PRNGKey
+    q: Setup, pair: Pair, gamma: Float[Array, ""] | float, rewards: ValueNorm, heard: Transition, looks: Looks
 ) -> tuple[Float[Array, ""], Metrics]:
     """The loss on one window [W, …] of one environment."""
-    heard, learned = steps.transition, q.config.sequence_length
+    network, learned = pair.network, q.config.sequence_length
     seen = heard if network.teacher is None else as_told(heard)
-    memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
-    if q.config.augment:  # what is remembered is not turned
-        memory = jax.tree.map(jnp.zeros_like, memory)
-    level = q.explorer.level(learner.exploration, learner.env_steps)
-    pair = Pair(network, learner.target, level.temperature)
     now = jax.tree.map(lambda leaf: leaf[:learned], seen)
     ends = window_ends(q, seen)
-    if q.forgetful:
-        online, _ = along(network.judge, now, (), key, pair.temperature)
+    online = jax.tree.map(lambda leaf: leaf[:learned], looks.online[0])
+    if looks.theirs is None:
         after = jax.tree.map(lambda leaf: leaf[ends.at], seen.next_observation)
         future = jax.vmap(lambda after: bootstrap(q, pair, after, (), ()))(after)
     else:
-        # What a teacher remembers is not kept.
-        before = memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
-        unrolled = along(network.judge, seen, before, key, pair.temperature)
-        theirs = along(pair.target.judge, seen, before, None, pair.temperature)
-        future = following(q, pair, seen, unrolled, theirs)[ends.at]
-        online = jax.tree.map(lambda leaf: leaf[:learned], unrolled[0])
+        future = following(q, pair, seen, looks.online, looks.theirs)[ends.at]
     value = jax.vmap(lambda *now: q.parts.team_value(network, *now))(online, now.decision.action, now.observation)
     shared = q.config.reward == "team" or not q.parts.own_values  # the team's value is learned from its reward
     reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
     reward = rewards.normalise(reward)[:, : value.shape[-1]]
-    error = value - jax.lax.stop_gradient(window_targets(q, seen, reward, future, ends, learner.hyper.gamma))
+    error = value - jax.lax.stop_gradient(window_targets(q, seen, reward, future, ends, gamma))
     real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
     auxiliary = {}
-    if network.teacher is not None:
-        heard = jax.tree.map(lambda leaf: leaf[:learned], heard)
-        teacher, (online, _) = online, along(network.agent, heard, memory, key, pair.temperature)
+    if looks.pupil is not None:
+        teacher, online = online, looks.pupil
         available = q.actions.mask(now.observation.action_mask)
         taught = jax.vmap(lesson)(online.head, teacher.head, available, now.observation.agent_mask)
         auxiliary["loss_lesson"] = taught.mean()
@@ -442,8 +462,10 @@ def loss(
     q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, batch: Experience, keys: Array
 ) -> tuple[Float[Array, ""], Metrics]:
     """The mean over windows [W, B, …]."""
-    one = partial(window_loss, q, network, learner, rewards)
-    losses = jax.vmap(one, (1, 0))(batch, keys)
+    level = q.explorer.level(learner.exploration, learner.env_steps)
+    pair = Pair(network, learner.target, level.temperature)
+    one = partial(window_loss, q, pair, learner.hyper.gamma, rewards)
+    losses = jax.vmap(one, 1)(batch.transition, look(q, pair, batch, keys))
     return jax.tree.map(lambda values: values.mean(0), losses)
 
 

@@ -24,7 +24,7 @@ from gacrl.config import files as configuration
 from gacrl.config import presets
 from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
-from gacrl.errors import UserError, full_memory, reason
+from gacrl.errors import UserError, full_memory, missing_device, reason
 from gacrl.report.screen import folded, terminal_width
 
 if TYPE_CHECKING:
@@ -85,6 +85,10 @@ def main(words: Sequence[str] | None = None) -> int:
         print(f"gacrl: {what}: {reason(error)}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:  # JAX's own is one; its class would have to be imported
+        missing = missing_device(error)
+        if missing is not None:
+            print(f"gacrl: {missing}: unset JAX_PLATFORMS, or name one that is there", file=sys.stderr)
+            return 2
         said = full_memory(error)
         if said is None:
             raise

@@ -161,28 +161,35 @@ def unroll(
     observations: Observation,
     first: Bool[Array, "T ..."],
     memory: Memory,
-    keys: Key[Array, " T"] | None,
+    keys: Key[Array, "T ..."] | None,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[AgentOutput, Memory]:
-    """The network over T steps of one environment: outputs, and the memory *after* each step, [T, …].
+    """The network over T steps of one environment [T, …], or of B [T, B, …]: outputs, and the memory *after* each step.
 
-    The memory starts anew where `first` [T], or [T, N] for each agent. What does not wait for the step before is
-    computed for all steps at once.
+    The memory starts anew where `first` [T, B], or [T, B, N] for each agent. What does not wait for the step before is
+    computed for all steps at once. Time stays in front: mapping this over environments turns every array twice.
     """
+
+    def each(function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.vmap(function) if observations.features.ndim == 4 else function
+
     if not isinstance(memory, AgentMemory):
-        return jax.vmap(lambda seen, key: network(seen, (), key, temperature))(observations, keys)
+        return jax.vmap(each(lambda seen, key: network(seen, (), key, temperature)))(observations, keys)
     if network.memory is not None and not jax.tree.leaves(memory.inbox):
-        seen = jax.vmap(lambda observation, key: network.see(observation, (), key))(observations, keys)
+        seen = jax.vmap(each(lambda observation, key: network.see(observation, (), key)))(observations, keys)
         carries = network.memory.unroll(seen.hidden, first, memory.carry)
         say = partial(network.say, temperature=temperature)
-        output, _ = jax.vmap(say)(observations, seen._replace(hidden=carries), keys)
+        output, _ = jax.vmap(each(say))(observations, seen._replace(hidden=carries), keys)
         return output, AgentMemory(carries, memory.inbox)
     fresh = network.initial_memory(observations.features.shape[-2])
 
+    def advance(
+        memory: Memory, seen: Observation, first: Bool[Array, "..."], key: Any
+    ) -> tuple[AgentOutput, Memory]:
+        return network(seen, restarted(fresh, memory, first), key, temperature)
+
     def step(memory: Memory, inputs: tuple[Observation, Bool[Array, "..."], Any]):
-        seen, first, key = inputs
-        memory = restarted(fresh, memory, first)
-        output, memory = network(seen, memory, key, temperature)
+        output, memory = each(advance)(memory, *inputs)
         return memory, (output, memory)
 
     return jax.lax.scan(step, memory, (observations, first, keys))[1]

@@ -6,7 +6,6 @@ import os
 from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,9 +17,8 @@ from jaxtyping import PyTree
 
 from gacrl.algorithms.shared import ENVS
 from gacrl.errors import UserError
+from gacrl.training import accelerator, program_cache
 
-_CACHE_BYTES = 512 * 2**20
-"""Bound of the compilation cache; the oldest programs go first."""
 KNOWN_XLA = jax.__version__.startswith("0.10.")
 """Whether XLA's flags and options below are known to this version."""
 _QUICKLY = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=2"
@@ -35,36 +33,35 @@ def prepare_jax(num_seeds: int = 1) -> None:
     Compiled programs are kept in the user's cache folder, so that a second start is quick; and most are compiled
     quickly, not for speed (`compiler_options`).
 
-    What the user has set already stays, and once JAX has started its devices stay as they are.
+    What the user has set already stays, and once JAX has started its devices stay as they are. Raises UserError where
+    the user asks for a GPU that JAX was installed without.
     """
     os.environ.setdefault("NPROC", "1")  # the size of XLA's thread pool, where there is one device
-    if KNOWN_XLA:
-        os.environ.setdefault("XLA_FLAGS", _QUICKLY)
+    chosen = accelerator.flags(_QUICKLY if KNOWN_XLA else None)
+    if chosen is not None:
+        os.environ.setdefault("XLA_FLAGS", chosen)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(RuntimeError):  # JAX has started
         if jax.config.jax_num_cpu_devices < 0:  # pyright: ignore[reportAttributeAccessIssue]
             jax.config.update("jax_num_cpu_devices", min(cores, num_seeds))
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        with contextlib.suppress(OSError):  # no place for a cache: work without one
-            (caches / "gacrl" / "jax").mkdir(parents=True, exist_ok=True)
-            jax.config.update("jax_compilation_cache_dir", str(caches / "gacrl" / "jax"))
-            jax.config.update("jax_compilation_cache_max_size", _CACHE_BYTES)
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    program_cache.keep()
 
 
-def compiler_options(for_speed: bool = True) -> dict[str, Any]:
+def compiler_options(for_speed: bool = True, library_sums: bool = False) -> dict[str, Any]:
     """Options for a training program, of many small pieces, on the versions that they were measured with.
 
     XLA hands matrix products and, from 0.10 on, also sums to a kernel library; for sums of this size the call
-    costs more than the sum (0.57 instead of 0.67 ms for a step of the paper's schedule).
+    costs more than the sum (0.57 instead of 0.67 ms for a step of the paper's schedule). Along windows of many steps it
+    is the other way round (docs/design.md): there `library_sums` leaves them to the library.
 
     for_speed: optimised as XLA does by itself, not as quickly compiled as all else is. Whoever sets XLA_FLAGS has the
     choice of both.
     """
     if not (KNOWN_XLA and jax.default_backend() == "cpu"):
         return {}
-    options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"}
+    options: dict[str, Any] = {}
+    if not library_sums:
+        options["xla_cpu_experimental_ynn_fusion_type"] = "LIBRARY_FUSION_TYPE_DOT"
     if for_speed and os.environ.get("XLA_FLAGS") == _QUICKLY:
         options |= {"xla_cpu_use_fusion_emitters": True, "xla_backend_optimization_level": 3}
     return options

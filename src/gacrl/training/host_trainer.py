@@ -51,7 +51,7 @@ class HostTrainer(AbstractTrainer):
             jax.process_count() == 1,
             f"{type(self.env).__name__} lives in Python: train it in one process, without --distributed",
         )
-        options = compiler_options(self.for_speed)
+        options = compiler_options(self.for_speed, self.algorithm.library_sums)
         self._decide = jax.jit(self._decided, compiler_options=options)
         self._learn = jax.jit(
             lambda running, played: follow(running, self._updated(running.state, played)),
