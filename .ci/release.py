@@ -15,6 +15,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+MOST_PACKAGES, MOST_MEGABYTES = 50, 850
 OLDEST, PYTHONS = "3.11", ("3.11", "3.12", "3.13")
 SMOKE = """
 import sys, time
@@ -72,12 +73,23 @@ def lowest() -> list[str]:
     return [re.sub(r">=", "==", need) for need in needs]
 
 
-def attempt(python: str, archive: Path, folder: Path, pins: list[str]) -> None:
-    """Install an archive into a fresh environment, and use it in a folder whose name has a space."""
+def weigh(environment: Path) -> str:
+    """Return how much is installed beside pip and setuptools. Raises SystemExit where it is more than promised."""
+    packages = {path.name.partition("-")[0] for path in environment.rglob("*.dist-info")} - {"pip", "setuptools"}
+    size = sum(path.lstat().st_blocks * 512 for path in environment.rglob("*")) / 2**20  # pip's files too
+    weight = f"{len(packages)} packages, {size:.0f} MB"
+    if len(packages) > MOST_PACKAGES or size > MOST_MEGABYTES:
+        raise SystemExit(f"an install takes {weight}; at most {MOST_PACKAGES} and {MOST_MEGABYTES} are promised")
+    return weight
+
+
+def attempt(python: str, archive: Path, folder: Path, pins: list[str]) -> str:
+    """Install an archive into a fresh environment, use it in a folder whose name has a space, return its weight."""
     subprocess.run([python, "-m", "venv", folder / "venv"], check=True)
     tool, elsewhere = folder / "venv" / "bin" / "python", folder / "some where"
     install = [tool, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", archive, *pins]
     subprocess.run(install, check=True)
+    weight = weigh(folder / "venv")
     elsewhere.mkdir()
     subprocess.run([tool, "-c", "import gacrl"], check=True, cwd=elsewhere)  # compiles its files
     subprocess.run([tool, "-c", SMOKE], check=True, cwd=elsewhere)
@@ -86,6 +98,7 @@ def attempt(python: str, archive: Path, folder: Path, pins: list[str]) -> None:
         done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"gacrl {' '.join(words)} ends with {done.returncode}:\n{done.stdout}{done.stderr}")
+    return weight
 
 
 def main(asked: list[str]) -> None:
@@ -104,8 +117,8 @@ def main(asked: list[str]) -> None:
                 print(f"{leg:12} SKIPPED: there is no Python {version} here", flush=True)
                 continue
             with tempfile.TemporaryDirectory(prefix=f"{leg}-", dir=place) as folder:
-                attempt(python, archives[kind], Path(folder), pins)
-            print(f"{leg:12} works: {archives[kind].name}", flush=True)
+                weight = attempt(python, archives[kind], Path(folder), pins)
+            print(f"{leg:12} works: {archives[kind].name}, {weight}", flush=True)
 
 
 if __name__ == "__main__":

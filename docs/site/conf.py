@@ -12,7 +12,6 @@ extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["conf.py"]
 
 myst_heading_anchors = 3
-myst_enable_extensions = ["attrs_block"]
 # Reports that the program writes have heads of the third level under the first.
 suppress_warnings = ["myst.header"]
 
