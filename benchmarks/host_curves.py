@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-import gacrl
-from gacrl.evaluation.statistics import difference
+from gacrl import api
+from gacrl.evaluation.statistics import difference, mean
 from gacrl.training.devices import prepare_jax
 
 TASKS = {"spread": "spread", "mpe2": "pettingzoo:mpe2.simple_spread_v3"}
@@ -25,7 +25,7 @@ METRIC = "return_agent_mean"
 
 def curve(task: str, env_steps: int, seeds: int) -> dict[str, Any]:
     """Return {env_steps: [K], return_agent_mean: [K, seeds]}."""
-    config = gacrl.api.settled("ippo", env=task)
+    config = api.settled("ippo", env=task)
     config = replace(
         config,
         num_seeds=seeds,
@@ -33,7 +33,7 @@ def curve(task: str, env_steps: int, seeds: int) -> dict[str, Any]:
         evaluation=replace(config.evaluation, interval=env_steps // 5, num_episodes=32),
     )
     found: dict[str, Any] = {"env_steps": [], METRIC: []}
-    for progress in gacrl.iterate(config):
+    for progress in api.iterate(config):
         found["env_steps"].append(progress.env_steps)
         found[METRIC].append([row["greedy"][METRIC] for row in progress.rows])
         print(task, progress.env_steps, [round(value, 3) for value in found[METRIC][-1]], flush=True)
@@ -49,7 +49,7 @@ if __name__ == "__main__":
     prepare_jax(given.seeds)
     curves = {name: curve(task, given.env_steps, given.seeds) for name, task in TASKS.items()}
     ours, theirs = (np.array(curves[name][METRIC][-1]) for name in TASKS)
-    apart = difference(theirs, ours)
+    apart = difference(theirs, ours, mean)
     print(f"mpe2 {theirs.mean():.2f}, spread {ours.mean():.2f}; apart {apart}")
     if given.out is not None:
         given.out.write_text(

@@ -172,6 +172,11 @@ def test_onnx_decides_as_the_run(name: str, tmp_path: Path):
     session = onnxruntime.InferenceSession(out.read_bytes(), providers=["CPUExecutionProvider"])
     assert [it.name for it in session.get_inputs()] == ["features", "alive"]
     assert [it.name for it in session.get_outputs()] == ["action", "adjacency", "messages"]
+    nodes = pytest.importorskip("onnx").load(out).graph.node
+    kinds = {node.op_type for node in nodes}
+    assert (
+        {"Relu", "LeakyRelu", "MatMul"} <= kinds and "Einsum" not in kinds and not any(it.domain for it in nodes)
+    )
 
 
 def test_what_decides_otherwise_is_not_written(written: Written):

@@ -8,6 +8,7 @@ from pathlib import Path
 from gacrl.errors import UserError
 from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
+from gacrl.export.lean import lean
 from gacrl.export.program import Program, flattened, program
 from gacrl.export.recorded import Arrays, compared
 from gacrl.export.source import Source
@@ -33,7 +34,15 @@ def write(source: Source, out: Path) -> Sequence[Path]:
 
 
 def convert(source: Source, it: Program) -> bytes:
-    """Return the program as a serialised ONNX model of opset 21."""
+    """Return the program as a serialised ONNX model of opset 21, with as few operators as it needs.
+
+    Raises UserError where jax2onnx cannot convert it.
+    """
+    return lean(traced(source, it))
+
+
+def traced(source: Source, it: Program) -> bytes:
+    """Return the program as jax2onnx makes it."""
     try:
         with _jax_as_it_is():
             from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
