@@ -6,9 +6,10 @@
     gacrl evaluate oracle --json | python benchmarks/keep.py - oracle "gacrl evaluate oracle"
 
 Takes a finished run, a finished study, or what `gacrl evaluate --json` prints. `--along` adds a metric at every
-evaluation of a run. A run that notes no commit may be kept where another one that does has begun to repeat it, bit for
-bit (`--repeated-by`); the file says so. Refuses what cannot be followed to one clean commit: sources that had changes, a run that was begun
-and ended by two commits, that diverged or lacks a seed, or a value that is not a finite number.
+evaluation of a run.
+
+Refuses what cannot be followed to one clean commit: sources that had changes, a run that was begun and ended by two
+commits, that diverged or lacks a seed, or a value that is not a finite number.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import numpy as np
 
 from gacrl.config import files
 from gacrl.errors import UserError
-from gacrl.experiments.provenance import COMMIT, commits, doubts, made_by
+from gacrl.experiments.provenance import COMMIT, commits, doubts
 from gacrl.training.recorder import RunFolder
 from gacrl.versions import DIRTY
 
@@ -36,12 +37,9 @@ def main() -> int:
     parser.add_argument("name")
     parser.add_argument("command", help="that made it")
     parser.add_argument("--along", metavar="METRIC", action="append", default=[], help="of a run, greedy")
-    parser.add_argument(
-        "--repeated-by", metavar="RUN", type=Path, help="that notes its commit; of a study, the run of that name"
-    )
     asked = parser.parse_args()
     try:
-        kept = _kept(asked.source, asked.command, asked.along, asked.repeated_by)
+        kept = _kept(asked.source, asked.command, asked.along)
     except UserError as error:
         print(f"keep: {error}", file=sys.stderr)
         return 2
@@ -51,17 +49,17 @@ def main() -> int:
     return 0
 
 
-def _kept(source: str, command: str, along: list[str], repeated_by: Path | None) -> dict[str, Any]:
+def _kept(source: str, command: str, along: list[str]) -> dict[str, Any]:
     if source == "-":
         return kept_evaluation(sys.stdin.read(), command)
     run = Path(source)
     if not (run / "config.json").is_file():
-        return kept_study(run, command, repeated_by)
-    kept = kept_summary(run, command, repeated_by)
+        return kept_study(run, command)
+    kept = kept_summary(run, command)
     return {**kept, "along": _along(run, along)} if along else kept
 
 
-def kept_summary(run: Path, command: str, repeated_by: Path | None = None) -> dict[str, Any]:
+def kept_summary(run: Path, command: str) -> dict[str, Any]:
     """The summary of a run and the command that made it. Raises UserError for one that may not be kept."""
     if (run / "diverged.json").is_file():
         raise UserError(f"{run} diverged: its seeds are no result")
@@ -72,11 +70,8 @@ def kept_summary(run: Path, command: str, repeated_by: Path | None = None) -> di
     except (OSError, ValueError) as error:
         raise UserError(f"{run} is no finished run ({type(error).__name__}): train it to its end first") from error
     config = files.load(run / "config.json")
-    if repeated_by is not None:
-        summary |= _repeated(run, summary["versions"], repeated_by)
     ended = summary["versions"].get(COMMIT)
-    noted = "versions" in origin and repeated_by is None  # earlier versions noted it at the end alone
-    begun = origin["versions"].get(COMMIT) if noted else ended
+    begun = origin["versions"].get(COMMIT) if "versions" in origin else ended  # earlier versions did not note it
     if begun is None or ended is None:
         raise UserError(f"{run} knows no commit: train it from a checkout of the repository")
     if begun != ended:
@@ -86,19 +81,7 @@ def kept_summary(run: Path, command: str, repeated_by: Path | None = None) -> di
     return {"command": command, **summary}
 
 
-def _repeated(run: Path, versions: dict[str, str], again: Path) -> dict[str, Any]:
-    """The versions of a run with the commit of one that repeats its evaluations. Raises UserError where none does."""
-    found = {(row["seed"], row["env_steps"]): row["greedy"] for row in RunFolder.open(run).metrics()}
-    rows = RunFolder.open(again).metrics()
-    if not rows or any(found.get((row["seed"], row["env_steps"])) != row["greedy"] for row in rows):
-        raise UserError(f"{again} does not repeat the evaluations of {run}")
-    (made,) = made_by([again])
-    places = ", ".join(f"seed {row['seed']} after {row['env_steps']:,} steps" for row in rows)
-    told = f"The run noted no commit. This one repeats its evaluations bit for bit: {places}."
-    return {"versions": {**versions, COMMIT: made[COMMIT]}, "commit_from": told}
-
-
-def kept_study(study: Path, command: str, repeated_by: Path | None = None) -> dict[str, Any]:
+def kept_study(study: Path, command: str) -> dict[str, Any]:
     """The summary of a study and the command that made it. Raises UserError for one that may not be kept."""
     try:
         summary = json.loads((study / "summary.json").read_text(encoding="utf-8"))
@@ -107,10 +90,6 @@ def kept_study(study: Path, command: str, repeated_by: Path | None = None) -> di
     made = summary.get("versions", [])
     for sentence in doubts(made):
         raise UserError(f"{study} cannot be kept. {sentence}")
-    if made and repeated_by is not None:
-        told = _repeated(study / repeated_by.name, made[0], repeated_by)
-        made = [told.pop("versions")]
-        summary |= told
     if not made or commits(made) == ["unknown"]:
         raise UserError(f"{study} knows no commit: make it from a checkout of the repository")
     if not np.isfinite(list(_numbers(summary))).all():

@@ -118,29 +118,3 @@ def test_a_study_is_kept_with_the_one_commit_of_its_runs(
             keep.kept_study(tmp_path, "gacrl talk")
     else:
         assert keep.kept_study(tmp_path, "gacrl talk") == {"command": "gacrl talk", **summary}
-
-
-def test_a_run_without_a_commit_is_kept_where_another_repeats_it_to_the_last_bit(keep: ModuleType, tmp_path: Path):
-    config = files.from_dict({"num_seeds": 2}, presets.preset("gacrl"))
-    for name, versions in (("run", {"jax": "0.10.2"}), ("again", {"jax": "0.10.2", "git_commit": CLEAN})):
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / "config.json").write_text(files.dumps(config), encoding="utf-8")
-        (folder / "origin.json").write_text(json.dumps({"versions": versions}), encoding="utf-8")
-    whole = {"seeds": [0, 1], "final": {"greedy": {"x": {"values": [1.0, 2.0]}}}, "versions": {"jax": "0.10.2"}}
-    (tmp_path / "run" / "summary.json").write_text(json.dumps(whole), encoding="utf-8")
-    rows = [{"seed": 0, "env_steps": step, "greedy": {"x": 0.1 * step}} for step in (100, 200)]
-    (tmp_path / "run" / "metrics.jsonl").write_text(
-        "".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8"
-    )
-    with pytest.raises(UserError, match="knows no commit"):
-        keep.kept_summary(tmp_path / "run", "gacrl train")
-    for x, same in ((10.0, True), (10.000001, False)):
-        row = json.dumps({**rows[0], "greedy": {"x": x}}) + "\n"
-        (tmp_path / "again" / "metrics.jsonl").write_text(row, encoding="utf-8")
-        if not same:
-            with pytest.raises(UserError, match="does not repeat the evaluations"):
-                keep.kept_summary(tmp_path / "run", "gacrl train", tmp_path / "again")
-            continue
-        kept = keep.kept_summary(tmp_path / "run", "gacrl train", tmp_path / "again")
-        assert kept["versions"]["git_commit"] == CLEAN and "seed 0 after 100 steps" in kept["commit_from"]

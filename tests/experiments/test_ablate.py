@@ -94,7 +94,11 @@ def finish(config: RunConfig, out: Path, score: float) -> session.Ended:
     )
     values = {"values": [score + 0.001 * k for k in range(config.num_seeds)]}
     of_better = {"git_commit": "decade-dirty", "jax": "0.11.0"} if score == 0.95 else CLEAN
-    summary = {"final": {"greedy": dict.fromkeys(METRICS, values)}, "versions": of_better}
+    summary = {
+        "seeds": list(config.seeds),
+        "final": {"greedy": dict.fromkeys(METRICS, values)},
+        "versions": of_better,
+    }
     folder.write_summary(summary)
     return session.Ended(out, config, STEPS[-1], summary)
 
@@ -166,6 +170,18 @@ def test_the_command_says_what_each_part_is_worth(
     before = len(trained)
     assert main(words) == 0
     assert len(trained) == before, "nothing is trained twice"
+    summary = out / "no-messages" / "summary.json"
+    for changed, because in (
+        ("[0, 1, 7]", "it holds seeds [0, 1, 7], not [0, 1, 2]"),
+        ("[0, 1, 2]", "lacks a value"),
+    ):
+        held = {**json.loads(summary.read_text(encoding="utf-8")), "seeds": json.loads(changed)}
+        if because == "lacks a value":
+            del held["final"]["greedy"][SCORE]["values"][0]
+        summary.write_text(json.dumps(held), encoding="utf-8")
+        capsys.readouterr()
+        assert main(words) == 2
+        assert because in capsys.readouterr().err
     assert main(["ablate", "--seeds", "4", "--out", str(out)]) == 2
     assert "holds another ablation" in capsys.readouterr().err
 

@@ -30,6 +30,7 @@ from gacrl.experiments.study import (
     Planned,
     Watch,
     claim_folder,
+    read_summary,
     reading,
     refuse_other_settings,
     train_missing,
@@ -182,7 +183,7 @@ def _outcome(run: Planned) -> Outcome:
 
 def _read_outcome(run: Planned) -> Outcome:
     folder = RunFolder.open(run.folder)
-    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
+    summary = read_summary(folder, run.config)
     rows = folder.metrics()
     steps = tuple(sorted({row["env_steps"] for row in rows}))
     by_seed = [[row for row in rows if row["seed"] == seed] for seed in run.config.seeds]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
 from gacrl.training import session
@@ -52,6 +54,21 @@ def reading(folder: Path) -> Generator[None]:
     except (KeyError, IndexError, TypeError, ValueError, RecursionError, OSError) as error:
         what = " ".join(f"{type(error).__name__}: {error}".split())
         raise UserError(f"{folder} is damaged ({what}): remove that folder to train the run again") from error
+
+
+def read_summary(folder: RunFolder, planned: RunConfig) -> dict[str, Any]:
+    """Return the summary of a finished run. Raises ValueError where its seeds are not those that were planned."""
+    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
+    seeds = list(planned.seeds)
+    if summary["seeds"] != seeds:
+        raise ValueError(f"it holds seeds {summary['seeds']}, not {seeds}")
+    for metrics in summary["final"].values():
+        for metric, entry in metrics.items():
+            if metric.startswith("score_"):
+                continue
+            if len(entry["values"]) != len(seeds) or not np.isfinite(entry["values"]).all():
+                raise ValueError(f"a seed of {seeds} lacks a value of {metric}")
+    return summary
 
 
 def why_diverged(folder: Path) -> str | None:

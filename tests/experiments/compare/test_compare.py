@@ -253,10 +253,13 @@ def test_a_training_horizon_may_differ_where_the_evaluation_is_the_same(make_run
 
 
 def test_other_measurements_are_noted(make_run: MakeRun):
-    run = make_run("b", MAPPO, LOW, episodes=64, versions={"gacrl": "0.2.0", "mpe2": "1.1.1"})
+    run = make_run(
+        "b", MAPPO, LOW, episodes=64, versions={"gacrl": "0.2.0", "mpe2": "1.1.1", "git_commit": "abc-dirty"}
+    )
     said = noted(compare([make_run("a", VDN, HIGH), run]))
     assert "the closing evaluations have 64 and 320 episodes: not the same starts" in said
     assert "made by different versions of gacrl" in said
+    assert f"the sources had changes when {run} ended: no commit has the code that made these numbers" in said
     assert "fewer than 10 seeds a side: this indicates" in said
 
 

@@ -583,6 +583,10 @@ def test_a_run_of_other_seeds_than_planned_is_refused(tmp_path: Path):
     (run.folder / "summary.json").write_text(json.dumps({**summary, "seeds": [0, 7]}), encoding="utf-8")
     with pytest.raises(UserError, match=r"holds seeds \[0, 7\], not \[0, 1\]"):
         evidence.read_series(run.folder)
+    summary["final"]["greedy"]["reward_raw"]["values"] = [1.0]
+    (run.folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    with pytest.raises(UserError, match=r"a seed of \[0, 1\] lacks a value of reward_raw"):
+        evidence.read_series(run.folder)
 
 
 # The whole command, on runs that are there already

@@ -30,6 +30,7 @@ from gacrl.experiments.compare.finished import (
     require_same_task,
 )
 from gacrl.experiments.compare.groups import NOT_SETTINGS, Group, grouped
+from gacrl.versions import DIRTY
 
 SHOWN = 2
 """Metrics that are compared unless some are asked for: the first of those that the task has in its tables."""
@@ -283,6 +284,10 @@ def _about_measurement(runs: Sequence[Finished]) -> Iterator[str]:
     }
     if len(versions) > 1:
         yield "the runs were made by different versions of gacrl"
+    noted = {str(run.path): run.summary.get("versions", {}).get("git_commit") or "" for run in runs}
+    changed = [path for path, commit in noted.items() if commit.endswith(DIRTY)]
+    if changed:
+        yield f"the sources had changes when {', '.join(changed)} ended: no commit has the code that made these numbers"
 
 
 def _show(value: Any) -> str:

@@ -3,7 +3,6 @@
 S seeds, K stretches of training (the episodes between two lines of the log), E episodes of a scripted policy.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -19,7 +18,7 @@ from gacrl.experiments.paper import references as scripted
 from gacrl.experiments.paper.references import Difficulty, Episodes, difficulty
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.provenance import Versions, made_by
-from gacrl.experiments.study import reading, why_diverged
+from gacrl.experiments.study import read_summary, reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]
@@ -154,9 +153,7 @@ def read_series(path: Path) -> Series:
 def _read_series(path: Path) -> Series:
     folder = RunFolder.open(path)
     config, rows = folder.config(), folder.metrics()
-    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
-    if summary["seeds"] != list(config.seeds):
-        raise ValueError(f"it holds seeds {summary['seeds']}, not {list(config.seeds)}")
+    summary = read_summary(folder, config)
     by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
     ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
     kept = np.flatnonzero(ended.min(0) > 0)
