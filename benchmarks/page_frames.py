@@ -2,8 +2,8 @@
 
     python benchmarks/page_frames.py [AGENTS …]     5 30 100 without any
 
-Of docs/pages/gacrl-teams.html, playing, alone and beside the untouched run: the time between two frames (16.7 ms are 60 a
-second), and what the page's own thread computes in each of them, which other work on the machine does not change.
+Of docs/pages/gacrl-teams.html, playing, alone and beside the untouched run: the time between two frames (16.7 ms are
+60 a second), and what the page's own thread computes in each of them, which other work on the machine hardly changes.
 """
 
 import os
