@@ -25,7 +25,6 @@ LAYERS = (
     ("errors", "extras", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
     (
         "cli.arguments",
-        "cli.tables",
         "envs",
         "messages.interventions",
         "networks",

@@ -11,6 +11,7 @@ from PIL import Image
 from test_render import world
 
 from gacrl import film, reel, render
+from gacrl.cli.main import main
 from gacrl.errors import UserError
 
 FFMPEG = """import json, sys
@@ -103,3 +104,18 @@ def test_a_strip_shows_moments_in_rows_and_what_is_beside_below(tmp_path: Path):
     np.testing.assert_array_equal(wide[:, first.width :], picture[first.height : 2 * first.height, -first.width :])
     with pytest.raises(UserError, match=r"a strip shows at most 6 episodes so, not 7; say --episodes 6"):
         film.write(played * 3 + played[:1], out, beside=reel.Beside(others * 3 + others[:1], ""))
+
+
+def test_the_name_of_what_plays_stands_on_the_film(tmp_path: Path, quick_start):
+    """Read from the file: its title is drawn as the name of the run is, and not as another one."""
+    out = tmp_path / "film.gif"
+    assert main(["render", "noop", "--episodes", "1", "--horizon", "5", "--out", str(out)]) == 0
+    with Image.open(out) as film:
+        assert (film.format, film.n_frames) == ("GIF", 6)
+        title = np.asarray(film.convert("L"))[:38]
+    drawn = {
+        name: np.asarray(render.frame(world([[0, 0]], [[0.5, 0.5]]), 0, title=name).convert("L"))[:38]
+        for name in ("noop", "random")
+    }
+    off = {name: np.abs(title.astype(int) - other).mean() for name, other in drawn.items()}
+    assert off["noop"] < 0.5 < 1 < off["random"]

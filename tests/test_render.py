@@ -239,19 +239,24 @@ def test_each_round_has_a_bubble_of_its_own_from_left_to_right():
     assert (picture(None)[-40:] != first[-40:]).any()
 
 
+def seen_as(colour: str, vision: str) -> np.ndarray:
+    """CIE Lab of a colour as somebody sees it."""
+    rgb = np.array(ImageColor.getrgb(colour)) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(VISION[vision] @ linear, 0, 1)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = to_xyz @ seen / to_xyz.sum(1)
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
 @pytest.mark.parametrize("vision", VISION)
 def test_colours_can_be_told_apart(vision):
-    def lab(colour: str) -> np.ndarray:
-        rgb = np.array(ImageColor.getrgb(colour)) / 255
-        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-        seen = np.clip(VISION[vision] @ linear, 0, 1)
-        to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-        xyz = to_xyz @ seen / to_xyz.sum(1)
-        x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-        return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
     colours = [*pen.SYMBOL_COLOURS, pen.COVERED]
-    assert min(np.linalg.norm(lab(a) - lab(b)) for a, b in itertools.combinations(colours, 2)) > 20
+    assert (
+        min(np.linalg.norm(seen_as(a, vision) - seen_as(b, vision)) for a, b in itertools.combinations(colours, 2))
+        > 20
+    )
 
 
 @pytest.mark.parametrize("agents", [1, 30])

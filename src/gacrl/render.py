@@ -142,7 +142,7 @@ class Picture:
         values = (
             f"{t} / {steps}",
             count if marks.there.any() else "",
-            f"{self._return[t]:.1f}".replace("-", "−"),
+            f"{round(self._return[t], 1) + 0.0:.1f}".replace("-", "−"),  # never −0.0
         )
         for (x, anchor), value in zip(self._columns(), values, strict=True):
             draw.text((x, y + px(36)), value, INK, typeface(px(17), True), anchor)

@@ -79,9 +79,9 @@ def test_a_film_says_what_was_done(tiny_run: TinyRun, tmp_path: Path, capsys: py
     assert main([*words, "--silence", "--out", str(tmp_path / "silent.gif")]) == 0
     assert main([*words, "--beside", "--size", "120", "--out", str(tmp_path / "both.png")]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0].endswith(f"heard.gif: 1 episodes of {tiny_run.folder}")
-    assert said[1].endswith(f"silent.gif: 1 episodes of {tiny_run.folder}; nobody hears anybody")
-    assert said[2].endswith(f"both.png: 1 episodes of {tiny_run.folder}; beside them nobody hears anybody")
+    assert said[0].endswith(f"heard.gif: 1 episode of {tiny_run.folder}")
+    assert said[1].endswith(f"silent.gif: 1 episode of {tiny_run.folder}; nobody hears anybody")
+    assert said[2].endswith(f"both.png: 1 episode of {tiny_run.folder}; beside them nobody hears anybody")
     heads: list[np.ndarray] = []
     for name in ("heard.gif", "silent.gif"):
         with Image.open(tmp_path / name) as film:

@@ -7,7 +7,8 @@ from rich.console import Console
 
 from gacrl.report import screen
 from gacrl.report.letters import PLAIN_LETTERS, in_letters_of
-from gacrl.report.screen import Pace, duration, folded, print_table
+from gacrl.report.screen import Pace, duration, folded
+from gacrl.report.tables import print_table
 
 COLUMNS = ("", "return", "coverage 0.1", "all covered", "collisions")
 ROWS = [
@@ -43,8 +44,9 @@ def test_a_narrow_screen_folds_the_columns_and_cuts_no_number(width: int, tables
 def test_where_no_column_has_room_each_row_is_a_block():
     rows = [["runs/" + "x" * 60, *ROWS[0][1:]]]
     assert printed(40, rows=rows)[1:] == [
-        "runs/" + "x" * 60,
-        *(f"  {caption} {cell}" for caption, cell in zip(COLUMNS[1:], ROWS[0][1:], strict=True)),
+        *("", "runs/" + "x" * 60),
+        *(f"  {caption:12}  {cell}" for caption, cell in zip(COLUMNS[1:], ROWS[0][1:], strict=True)),
+        "",
     ]
 
 

@@ -25,6 +25,8 @@ def compare(words: Words) -> int:
     for path in (asked.out and pages.file_of(asked.out), asked.marl_eval, asked.csv):
         if path is not None and path.exists() and not asked.overwrite:
             raise UserError(f"{path} exists: choose another place, or say --overwrite")
+    if asked.out is not None and pages.file_of(asked.out) == asked.out and not asked.out.parent.is_dir():
+        raise UserError(f"there is no folder {asked.out.parent} to write {asked.out.name} into")
     play = "sampled" if asked.sampled else "greedy"
     playing = asked.out is not None and asked.replays
     if playing or asked.horizon is not None:

@@ -420,7 +420,7 @@ def _render(words: Words) -> int:
         beside = Beside(other.episodes, f"{also}: {asked.run}")
     film.write(shown.episodes, out, asked.size, title, shown.task.words, beside)
     notes = "".join(f"; {note}" for note in (told, f"beside them {also}" if also else "") if note)
-    print(f"{asked.out}: {len(shown.episodes)} episodes of {asked.run}{notes}")
+    print(f"{asked.out}: {asked.episodes} episode{'s' * (asked.episodes > 1)} of {asked.run}{notes}")
     return 0
 
 

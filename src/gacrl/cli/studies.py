@@ -153,7 +153,8 @@ def _print_answer(done: "Talk") -> None:
     """Print what every learner earns, and the answer."""
     from gacrl.cli.terminal import console
     from gacrl.experiments import talk
-    from gacrl.report.screen import print_table, say
+    from gacrl.report.screen import say
+    from gacrl.report.tables import print_table
 
     screen = console()
     title = f"random agents earn {done.answer.random:.2f}"

@@ -15,7 +15,8 @@ from rich.text import Text
 from gacrl.cli import stopwatch
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
-from gacrl.report.screen import Pace, console, duration, print_table, say
+from gacrl.report.screen import Pace, console, duration, say
+from gacrl.report.tables import print_table
 from gacrl.training.build import Plan
 from gacrl.training.diagnosis import Diagnosis
 from gacrl.training.footprint import readable

@@ -1,6 +1,6 @@
-"""Text and tables for a terminal of any width: what does not fit is folded, and a number is never cut.
+"""Text for a terminal of any width: what does not fit is folded.
 
-It imports Rich only for tables.
+It imports Rich only for a console.
 """
 
 import os
@@ -9,19 +9,14 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
-
-from gacrl.report.letters import in_letters_of
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
 WIDTH = 130
 """Columns where nothing is known of a terminal: a log can hold such lines."""
 _NARROWEST = 20
-_ENDLESS = 100_000
 _BELOW = 6
 """How far in stands what has no room beside its line."""
 
@@ -79,82 +74,6 @@ class Pace:
         """Write the time to the end, after so many parts of them: "12 min left", or nothing before anything is done."""
         took = time.monotonic() - self._begun
         return f"{duration(took / done * (self._parts - done))} left" if done > 0 else ""
-
-
-def print_table(
-    screen: "Console",
-    columns: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    title: str = "",
-    keys: int = 1,
-    sections: Collection[int] = (),
-) -> None:
-    """Print rows of cells under a title, however narrow the screen is.
-
-    Where they do not fit, captions break at their spaces; then the columns are folded into several tables, each with
-    the first `keys` columns again; and where one of them does not fit, each row is a block of lines. sections: rows
-    with a gap after them.
-    """
-    if title:
-        screen.print(title, soft_wrap=True)
-    columns = [in_letters_of(screen.encoding, caption) for caption in columns]
-    rows = [[in_letters_of(screen.encoding, cell) for cell in row] for row in rows]
-    whole = _fits(screen, columns, rows)
-    folds = [range(len(columns))] if whole else _folds(screen, columns, rows, keys)
-    for fold in folds:
-        screen.print(_table(columns, rows, fold, sections, stacked=not whole))
-    if folds:
-        return
-    for row in rows:
-        screen.print(" ".join(row[:keys]), soft_wrap=True)
-        for caption, cell in zip(columns[keys:], row[keys:], strict=True):
-            screen.print(f"  {caption} {cell}".rstrip(), soft_wrap=True)
-
-
-def _fits(
-    screen: "Console", columns: Sequence[str], rows: Sequence[Sequence[str]], some: Sequence[int] | None = None
-) -> bool:
-    """Whether a table of all columns fits as it is, or one of some of them with its captions stacked."""
-    table = _table(columns, rows, range(len(columns)) if some is None else some, stacked=some is not None)
-    return screen.measure(table, options=screen.options.update(width=_ENDLESS)).maximum <= screen.width
-
-
-def _folds(
-    screen: "Console", columns: Sequence[str], rows: Sequence[Sequence[str]], keys: int
-) -> list[Sequence[int]]:
-    """The columns of each table; empty where some column has no room beside the keys."""
-    first = range(keys)
-    folds: list[Sequence[int]] = []
-    fold: list[int] = []
-    for column in range(keys, len(columns)):
-        if _fits(screen, columns, rows, [*first, *fold, column]):
-            fold.append(column)
-        elif fold and _fits(screen, columns, rows, [*first, column]):
-            folds.append([*first, *fold])
-            fold = [column]
-        else:
-            return []
-    return [*folds, [*first, *fold]]
-
-
-def _table(
-    columns: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    shown: Sequence[int],
-    sections: Collection[int] = (),
-    stacked: bool = False,
-) -> "Table":
-    """Some of the columns. stacked: captions are broken at their spaces."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for column in shown:
-        caption = columns[column].replace(" ", "\n") if stacked else columns[column]
-        table.add_column(caption, no_wrap=True)
-    for number, row in enumerate(rows):
-        table.add_row(*(row[column] for column in shown), end_section=number in sections)
-    return table
 
 
 def _folded_line(line: str, width: int) -> str:

@@ -105,9 +105,10 @@ def _episodes(page: "Page", comparison: Comparison, galleries: "Sequence[Gallery
     page.heading("Episodes")
     for gallery in galleries:
         if gallery.shown:
+            of = "of the closing evaluation" if gallery.closing else "with starts of their own"
             page.text(
-                f"{gallery.name}: the best, the median and the worst {len(gallery.shown) - 2} of {gallery.of:,} "
-                "episodes of the closing evaluation by their return, over all seeds."
+                f"{gallery.name}: the best, the median and the worst {max(len(gallery.shown) - 2, 0)} of "
+                f"{gallery.of:,} episodes {of} by their return, over all seeds."
             )
         else:
             page.text(f"{gallery.name}: no episodes to play, since {gallery.because}.")

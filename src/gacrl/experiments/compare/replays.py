@@ -39,6 +39,8 @@ class Gallery(NamedTuple):
     """Episodes as plain data: {rank, seed, number, value, replay}, the best one first; none: see `because`."""
     of: int = 0
     """How many episodes they were chosen from."""
+    closing: bool = True
+    """Whether they are all of the closing evaluation; fewer, for want of memory, have starts of their own."""
     because: str = ""
     """Why there is nothing."""
 
@@ -108,7 +110,7 @@ def _gallery(group: Group, comparison: Comparison, tell: Warn) -> Gallery:
         return Gallery(group.name, [], because=str(error))
     sizes = np.cumsum([len(json.dumps(it)) for it in shown])
     kept = int((sizes <= _MOST_BYTES // len(comparison.groups)).sum())
-    return Gallery(group.name, shown[: max(kept, 1)], returns.size)
+    return Gallery(group.name, shown[: max(kept, 1)], returns.size, seeds.episodes == comparison.episodes)
 
 
 def _seeds(group: Group, comparison: Comparison) -> _Seeds:

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from gacrl.cli.tables import print_table
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import Equivalence, with_interval
 from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair
 from gacrl.experiments.compare.finished import closing_value
 from gacrl.experiments.compare.groups import Group
 from gacrl.report.screen import console
+from gacrl.report.tables import print_table
 
 _SHOWN_DIFFERENCES = 12
 """Settings listed in the terminal; the page and the JSON have all."""

@@ -144,6 +144,7 @@ const act = {
     still.hovered = thing;
     const about = thing?.symbol === undefined ? null : aboutWord(page.dictionary, thing.index, thing.round, thing.symbol, page);
     byId("word").hidden = about === null;
+    byId("word").classList.toggle("above", about !== null && thing.y > view.size / 2);  // not over the word
     say(byId("word"), about ?? "");
     view.canvas.style.cursor = thing === null ? "default" : session.movable ? "grab" : "pointer";
   },

@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from gacrl.cli.tables import print_table
+from gacrl.report.tables import print_table
 
 COLUMNS = ("who", "difference", "what the seeds say")
 ROWS = [
@@ -36,7 +36,7 @@ def test_a_wide_screen_has_a_table():
 
 def test_a_narrow_screen_has_blocks_and_leaves_out_what_is_empty():
     rows = [(*ROWS[0],), ("oracle", "-5.520", "")]
-    assert printed(40, rows) == [
+    assert printed(30, rows) == [
         *("", "gacrl", "  difference", "    -31.123 [-46.123, -26.123]", "  what the seeds say"),
         *("    cannot be told apart", "oracle", "  difference  -5.520", ""),
     ]
