@@ -5,7 +5,8 @@
 
 `page` serves pretrained:gacrl-teams and measures from the line with the address on: seconds to the first frame (and in
 Chromium, where it and Playwright are there, to the page that can be used), seconds until a change of the number of
-agents is answered, and policy steps a second with 100 agents, untouched and with a silenced agent, which is two lanes.
+agents is answered, and policy steps a second with 100 agents, untouched and with a silenced agent, which is two lanes. CPU seconds
+of the server stand beside: a machine that has other things to do says little by its clock.
 
 `train` trains the preset vdn with `--view` and without, in turns (off on, on off, …), while a visitor watches at the
 page's normal speed, five steps a second. It prints the ratio of the training's steps a second (without compiling and
@@ -33,6 +34,8 @@ from websockets.sync.client import connect
 CROWD = 100
 AT_HOME = 5
 """Agents that pretrained:gacrl-teams has by itself."""
+STEPS = 60
+"""Of a measurement with 100 agents."""
 WARM = 60.0
 """Seconds at the most that the programs for other numbers of agents are given."""
 
@@ -68,22 +71,22 @@ def visiting(address: str) -> Iterator[Line]:
 
 
 @contextlib.contextmanager
-def serving(*words: str) -> Iterator[tuple[str, float]]:
-    """`gacrl view` in a process of its own: its address, and the seconds that it took to print it."""
+def serving(*words: str) -> Iterator[tuple[str, float, int]]:
+    """`gacrl view` in a process of its own: its address, the seconds that it took to print it, and its number."""
     begun = time.perf_counter()
     command = [sys.executable, "-m", "gacrl", "view", *words, "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:
             line = next(line for line in server.stdout if line.startswith("page "))
-            yield line.split()[1], time.perf_counter() - begun
+            yield line.split()[1], time.perf_counter() - begun, server.pid
         finally:
             server.terminate()
 
 
 def page(rounds: int) -> dict[str, Any]:
     """Everything about the page."""
-    with serving("pretrained:gacrl-teams") as (address, up):
+    with serving("pretrained:gacrl-teams") as (address, up, process):
         begun = time.perf_counter()
         with visiting(address) as line:
             line.scene(1, AT_HOME)
@@ -98,13 +101,14 @@ def page(rounds: int) -> dict[str, Any]:
                 f"answer to {count} agents": statistics.median(change(line, seed, count) for seed in range(rounds))
                 for count in (AT_HOME + 1, 30, CROWD)
             }
-            untouched = [pace(line, 10 + seed) for seed in range(rounds)]
             silence = {"at": 0, "kind": "fate", "agent": 0, "fate": {"kind": "silence"}}
-            both = [pace(line, 30 + seed, silence) for seed in range(rounds)]
+            pace(line, process, 9, silence)
+            untouched = [pace(line, process, 10 + seed) for seed in range(rounds)]
+            both = [pace(line, process, 30 + seed, silence) for seed in range(rounds)]
     return {
         **{name: round(value, 3) for name, value in found.items()},
-        "steps a second with 100 agents": [round(value, 1) for value in untouched],
-        "the same with an agent silenced, two lanes": [round(value, 1) for value in both],
+        "100 agents: [steps a second, CPU ms a step]": untouched,
+        "the same, one silenced, two lanes": both,
         "load": os.getloadavg(),
     }
 
@@ -127,13 +131,14 @@ def wait_until_warm(line: Line) -> None:
         time.sleep(1)
 
 
-def pace(line: Line, seed: int, *events: dict[str, Any]) -> float:
-    """Steps a second of an episode with 100 agents, frames sent and read."""
+def pace(line: Line, process: int, seed: int, *events: dict[str, Any]) -> tuple[float, float]:
+    """Steps a second of an episode with 100 agents, frames sent and read; and the server's CPU ms of a step."""
     line.scene(seed, CROWD, *events)
     line.frames(0, 0)
-    begun = time.perf_counter()
-    line.frames(1, 60)
-    return 60 / (time.perf_counter() - begun)
+    begun, spent = time.perf_counter(), cpu_seconds(process)
+    line.frames(1, STEPS)
+    seconds, spent = time.perf_counter() - begun, cpu_seconds(process) - spent
+    return round(STEPS / seconds, 1), round(1000 * spent / STEPS, 1)
 
 
 def first_paint(address: str) -> float | None:

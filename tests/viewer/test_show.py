@@ -67,7 +67,7 @@ def test_a_moment_comes_back_and_only_what_changed_is_played_again(quick_start: 
     show.take(Scene(3, 2))
     first = [show.frame(t)["main"] for t in range(26)]
     kept = list(show.main.moments)
-    show.take(Scene(3, 2, (Event(9, "move", thing="mark", index=1, place=(0.25, -0.5)),)))
+    show.take(Scene(3, 2, (Event(9, "move", thing="mark", which=1, place=(0.25, -0.5)),)))
     assert [a is b for a, b in zip(show.main.moments, kept, strict=False)] == [True] * 9
     moved = show.frame(9)["main"]
     assert (moved["marks"]["x"][1], moved["marks"]["y"][1]) == (0.25, -0.5) and show.frame(9)["twin"] is None
