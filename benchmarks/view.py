@@ -5,8 +5,8 @@
 
 `page` serves pretrained:gacrl-teams and measures from the line with the address on: seconds to the first frame (and in
 Chromium, where it and Playwright are there, to the page that can be used), seconds until a change of the number of
-agents is answered, and policy steps a second with 100 agents, untouched and with a silenced agent, which is two lanes. CPU seconds
-of the server stand beside: a machine that has other things to do says little by its clock.
+agents is answered, and policy steps a second with 100 agents, untouched and with a silenced agent, which is two lanes.
+CPU time of the server stands beside: on a machine that has other things to do the clock says little.
 
 `train` trains the preset vdn with `--view` and without, in turns (off on, on off, …), while a visitor watches at the
 page's normal speed, five steps a second. It prints the ratio of the training's steps a second (without compiling and

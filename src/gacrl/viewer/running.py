@@ -16,7 +16,6 @@ from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
 
-
 _FIRST_PICTURE = 30.0
 """Seconds that the compiler waits for a visitor, who would otherwise wait for it."""
 
