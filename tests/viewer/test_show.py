@@ -123,6 +123,9 @@ class Walk(Environment):
         state = places + 0.1 * action[:, None], clock + 1
         return state, TimeStep(self.look(state), action * 1.0, state[1] > 3, state[1] >= self.max_cycles)
 
+    def seen_in(self, state, params=()):
+        return self.look(state)
+
     def look(self, state):
         return observe(state[0], num_actions=2, positions=state[0])
 
