@@ -1,15 +1,17 @@
 """How quickly the live page answers, and what it costs a training.
 
     python benchmarks/view.py page [--rounds 3] [--json]
-    python benchmarks/view.py train [--rounds 3] [--env-steps 30000] [--num-seeds 2] [--json]
+    python benchmarks/view.py train [--env-steps 160000] [--interval 4096] [--num-seeds 2] [--json]
 
 `page` serves pretrained:gacrl-teams and measures from the line with the address on: seconds to the first frame (and in
 Chromium, where it and Playwright are there, to the page that can be used), seconds until a change of the number of
 agents is answered, and policy steps a second with 100 agents, untouched and with a silenced agent, which is two lanes.
+CPU time of the server stands beside: on a machine that has other things to do the clock says little.
 
-`train` trains the preset vdn with `--view` and without, in turns (off on, on off, …), while a visitor watches at the
-page's normal speed, five steps a second. It prints the ratio of the training's steps a second (without compiling and
-evaluation), turn by turn, and the CPU seconds of the page's process beside those of the training.
+`train` trains the preset vdn with `--view` while a visitor watches at the page's normal speed, five steps a second.
+From one evaluation to the next the page's process goes on and is stopped in turns, so that what else the machine does
+hits both alike. It prints the median ratio of the training's steps a second (without compiling and evaluation), on to
+off, of neighbouring chunks, with its quartiles; and the CPU seconds of the page's process beside those of the training.
 """
 
 import argparse
@@ -18,6 +20,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
@@ -33,6 +36,8 @@ from websockets.sync.client import connect
 CROWD = 100
 AT_HOME = 5
 """Agents that pretrained:gacrl-teams has by itself."""
+STEPS = 60
+"""Of a measurement with 100 agents."""
 WARM = 60.0
 """Seconds at the most that the programs for other numbers of agents are given."""
 
@@ -68,22 +73,22 @@ def visiting(address: str) -> Iterator[Line]:
 
 
 @contextlib.contextmanager
-def serving(*words: str) -> Iterator[tuple[str, float]]:
-    """`gacrl view` in a process of its own: its address, and the seconds that it took to print it."""
+def serving(*words: str) -> Iterator[tuple[str, float, int]]:
+    """`gacrl view` in a process of its own: its address, the seconds that it took to print it, and its number."""
     begun = time.perf_counter()
     command = [sys.executable, "-m", "gacrl", "view", *words, "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         try:
             line = next(line for line in server.stdout if line.startswith("page "))
-            yield line.split()[1], time.perf_counter() - begun
+            yield line.split()[1], time.perf_counter() - begun, server.pid
         finally:
             server.terminate()
 
 
 def page(rounds: int) -> dict[str, Any]:
     """Everything about the page."""
-    with serving("pretrained:gacrl-teams") as (address, up):
+    with serving("pretrained:gacrl-teams") as (address, up, process):
         begun = time.perf_counter()
         with visiting(address) as line:
             line.scene(1, AT_HOME)
@@ -98,13 +103,14 @@ def page(rounds: int) -> dict[str, Any]:
                 f"answer to {count} agents": statistics.median(change(line, seed, count) for seed in range(rounds))
                 for count in (AT_HOME + 1, 30, CROWD)
             }
-            untouched = [pace(line, 10 + seed) for seed in range(rounds)]
             silence = {"at": 0, "kind": "fate", "agent": 0, "fate": {"kind": "silence"}}
-            both = [pace(line, 30 + seed, silence) for seed in range(rounds)]
+            pace(line, process, 9, silence)
+            untouched = [pace(line, process, 10 + seed) for seed in range(rounds)]
+            both = [pace(line, process, 30 + seed, silence) for seed in range(rounds)]
     return {
         **{name: round(value, 3) for name, value in found.items()},
-        "steps a second with 100 agents": [round(value, 1) for value in untouched],
-        "the same with an agent silenced, two lanes": [round(value, 1) for value in both],
+        "100 agents: [steps a second, CPU ms a step]": untouched,
+        "the same, one silenced, two lanes": both,
         "load": os.getloadavg(),
     }
 
@@ -127,13 +133,14 @@ def wait_until_warm(line: Line) -> None:
         time.sleep(1)
 
 
-def pace(line: Line, seed: int, *events: dict[str, Any]) -> float:
-    """Steps a second of an episode with 100 agents, frames sent and read."""
+def pace(line: Line, process: int, seed: int, *events: dict[str, Any]) -> tuple[float, float]:
+    """Steps a second of an episode with 100 agents, frames sent and read; and the server's CPU ms of a step."""
     line.scene(seed, CROWD, *events)
     line.frames(0, 0)
-    begun = time.perf_counter()
-    line.frames(1, 60)
-    return 60 / (time.perf_counter() - begun)
+    begun, spent = time.perf_counter(), cpu_seconds(process)
+    line.frames(1, STEPS)
+    seconds, spent = time.perf_counter() - begun, cpu_seconds(process) - spent
+    return round(STEPS / seconds, 1), round(1000 * spent / STEPS, 1)
 
 
 def first_paint(address: str) -> float | None:
@@ -157,75 +164,71 @@ def first_paint(address: str) -> float | None:
     return seconds
 
 
-def train(rounds: int, env_steps: int, num_seeds: int) -> dict[str, Any]:
+def train(env_steps: int, interval: int, num_seeds: int) -> dict[str, Any]:
     """Everything about a training that is watched."""
-    turns: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(rounds):
-            order = (False, True) if number % 2 == 0 else (True, False)
-            pair = {
-                watched: trained(Path(folder), f"{number}-{watched}", env_steps, num_seeds, watched)
-                for watched in order
+        out = Path(folder) / "run"
+        command = [sys.executable, "-m", "gacrl", "train", "--preset", "vdn", "--env-steps", str(env_steps)]
+        command += ["--num-seeds", str(num_seeds), "--evaluation.interval", str(interval), "--out", str(out)]
+        command += ["--view", "--view-port", "0"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+            assert run.stdout is not None
+            address, ended, seen = "", threading.Event(), {"frames": 0}
+            for line in run.stdout:
+                address = line.split()[1] if line.startswith("page ") and "http" in line else address
+                if line.startswith("page ") and "is open" in line:
+                    break
+            threading.Thread(target=watch, args=(address, seen, ended), daemon=True).start()
+            child = int(Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()[-1])
+            spent = {"page": -cpu_seconds(child), "training": -cpu_seconds(run.pid)}
+            chunks = in_turns(out / "metrics.jsonl", child, num_seeds, env_steps)
+            spent = {
+                "page": spent["page"] + cpu_seconds(child),
+                "training": spent["training"] + cpu_seconds(run.pid),
             }
-            on, off = pair[True], pair[False]
-            turns.append(
-                {
-                    "steps a second off": round(off["steps"]),
-                    "on": round(on["steps"]),
-                    "ratio": round(on["steps"] / off["steps"], 3),
-                    "CPU seconds of training": round(on["cpu"], 1),
-                    "of the page": round(on["page"], 2),
-                    "frames watched": on["frames"],
-                }
-            )
-            print(turns[-1], file=sys.stderr, flush=True)
+            ended.set()
+            run.stdout.read()
+    ratios = [one / two for one, two in zip(chunks[True], chunks[False], strict=False)]
+    quartiles = statistics.quantiles(ratios, n=4)
     return {
-        "turns": turns,
-        "median ratio": statistics.median(turn["ratio"] for turn in turns),
-        "CPU seconds of the page over those of training": round(
-            sum(turn["of the page"] for turn in turns) / sum(turn["CPU seconds of training"] for turn in turns), 4
-        ),
+        "pairs of chunks": len(ratios),
+        "steps a second, on over off": [round(value, 3) for value in (quartiles[1], quartiles[0], quartiles[2])],
+        "sums over all chunks": round(harmonic(chunks[True]) / harmonic(chunks[False]), 3),
+        "steps a second off, median": round(statistics.median(chunks[False])),
+        "frames watched": seen["frames"],
+        "CPU seconds of the page, half of the time on": round(spent["page"], 2),
+        "CPU seconds of training": round(spent["training"], 1),
         "load": os.getloadavg(),
     }
 
 
-def trained(folder: Path, name: str, env_steps: int, num_seeds: int, watched: bool) -> dict[str, Any]:
-    """Train once: its pace, and the CPU seconds of its process and of the page's."""
-    out, seen = folder / name, {"frames": 0, "page": 0.0, "cpu": 0.0}
-    command = [
-        sys.executable,
-        "-m",
-        "gacrl",
-        "train",
-        "--preset",
-        "vdn",
-        "--env-steps",
-        str(env_steps),
-        "--out",
-        str(out),
-    ]
-    command += ["--num-seeds", str(num_seeds), "--evaluation.interval", str(env_steps // 10)]
-    command += ["--view", "--view-port", "0"] if watched else []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
-        assert run.stdout is not None
-        ended, address = threading.Event(), ""
-        threading.Thread(target=account, args=(run.pid, seen, ended), daemon=True).start()
-        for line in run.stdout:
-            address = line.split()[1] if line.startswith("page ") and "http" in line else address
-            if line.startswith("page ") and "is open" in line:
-                threading.Thread(target=watch, args=(address, seen, ended), daemon=True).start()
-        ended.set()
-    summary = json.loads((out / "summary.json").read_text())
-    return {**seen, "steps": summary["steps_per_second"]}
+def in_turns(metrics: Path, child: int, num_seeds: int, env_steps: int) -> dict[bool, list[float]]:
+    """Stop the page and let it go on, chunk by chunk; the training's steps a second in the chunks of each kind."""
+    chunks: dict[bool, list[float]] = {True: [], False: []}
+    running, before = True, None
+    try:
+        while True:
+            rows = [
+                json.loads(line) for line in metrics.read_text().splitlines(keepends=True) if line.endswith("\n")
+            ]
+            row = rows[-1]
+            done = row["env_steps"] * num_seeds, row["env_steps"] * num_seeds / row["steps_per_second"]
+            if before is None or done[0] != before[0]:
+                if before is not None:
+                    chunks[running].append((done[0] - before[0]) / (done[1] - before[1]))
+                    running = not running
+                    os.kill(child, signal.SIGCONT if running else signal.SIGSTOP)
+                before = done
+            if row["env_steps"] >= env_steps:
+                return chunks
+            time.sleep(0.01)
+    finally:
+        os.kill(child, signal.SIGCONT)
 
 
-def account(process: int, seen: dict[str, Any], ended: threading.Event) -> None:
-    """Note the CPU seconds of a training and of its page, as long as they live."""
-    while not ended.wait(0.5):
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-            seen["cpu"] = cpu_seconds(process)
-            seen["page"] = sum(map(cpu_seconds, map(int, children)))
+def harmonic(paces: list[float]) -> float:
+    """Steps a second of chunks that have as many steps each, together."""
+    return len(paces) / sum(1 / pace for pace in paces)
 
 
 def cpu_seconds(process: int) -> float:
@@ -251,11 +254,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("page", "train"))
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--env-steps", type=int, default=30_000)
+    parser.add_argument("--env-steps", type=int, default=160_000)
+    parser.add_argument("--interval", type=int, default=4_096)
     parser.add_argument("--num-seeds", type=int, default=2)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    found = page(asked.rounds) if asked.what == "page" else train(asked.rounds, asked.env_steps, asked.num_seeds)
+    found = page(asked.rounds) if asked.what == "page" else train(asked.env_steps, asked.interval, asked.num_seeds)
     for name, value in found.items():
         print(f"{name:48} {value}")
     if asked.json:

@@ -127,7 +127,7 @@ def test_nothing_but_a_refusal_comes_out_of_nonsense(message: Any):
 
 
 def test_the_first_step_that_differs_is_where_playing_begins_again():
-    move = Event(3, "move", thing="mark", index=0)
+    move = Event(3, "move", thing="mark", which=0)
     one = Scene(1, 2, (Event(1, "add"), move))
     assert first_difference(one, one) > 10**6
     assert first_difference(one, Scene(2, 2, one.events)) == 0

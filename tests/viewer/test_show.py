@@ -1,5 +1,7 @@
 """What a page shows is what the policy does: the same words, places and rewards as everywhere else in the library."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +9,12 @@ import pytest
 from conftest import soaked
 from serving import cast_of
 
-from gacrl import rollout
+from gacrl import Environment, Task, TimeStep, observe, rollout
 from gacrl.messages import interventions
+from gacrl.tasks import own
 from gacrl.types import Arrives, Intervention
 from gacrl.viewer.cast import open_cast
-from gacrl.viewer.requests import Event, Fate, Scene
+from gacrl.viewer.requests import Bounds, Event, Fate, Scene
 from gacrl.viewer.show import Show
 
 SPOKEN = Arrives(
@@ -67,7 +70,7 @@ def test_a_moment_comes_back_and_only_what_changed_is_played_again(quick_start: 
     show.take(Scene(3, 2))
     first = [show.frame(t)["main"] for t in range(26)]
     kept = list(show.main.moments)
-    show.take(Scene(3, 2, (Event(9, "move", thing="mark", index=1, place=(0.25, -0.5)),)))
+    show.take(Scene(3, 2, (Event(9, "move", thing="mark", which=1, place=(0.25, -0.5)),)))
     assert [a is b for a, b in zip(show.main.moments, kept, strict=False)] == [True] * 9
     moved = show.frame(9)["main"]
     assert (moved["marks"]["x"][1], moved["marks"]["y"][1]) == (0.25, -0.5) and show.frame(9)["twin"] is None
@@ -100,6 +103,48 @@ def test_agents_come_and_go_and_a_radius_silences(quick_start: None):
     assert sum(map(len, muted["main"]["hears"])) == 0 < sum(map(len, muted["twin"]["hears"]))
     with pytest.raises(StopIteration):
         player.places(101)
+
+
+@dataclass(frozen=True)
+class Walk(Environment):
+    """Two agents, a place to go to, and no scene: where they are is all that is known."""
+
+    max_cycles: int = 6
+    num_agents = 2
+    num_actions = 2
+    observation_size = 2
+
+    def reset(self, key, params=()):
+        state = jax.random.uniform(key, (2, 2)), jnp.asarray(0)
+        return state, self.look(state)
+
+    def step(self, state, action, key, params=()):
+        places, clock = state
+        state = places + 0.1 * action[:, None], clock + 1
+        return state, TimeStep(self.look(state), action * 1.0, state[1] > 3, state[1] >= self.max_cycles)
+
+    def seen_in(self, state, params=()):
+        return self.look(state)
+
+    def look(self, state):
+        return observe(state[0], num_actions=2, positions=state[0])
+
+
+def test_a_task_of_ones_own_can_be_watched_and_moved(quick_start: None, from_outside: None):
+    """Episodes that end early are over there; what a hand moves is where it was put, and goes on from there."""
+
+    def edit(state, hand):
+        return jnp.where(hand.agents.moved[:, None], hand.agents.positions, state[0]), state[1]
+
+    own.bring(Task("walk", Walk, lambda settings: settings, edit=edit))
+    cast = open_cast(["random"], task="walk")
+    assert cast.bounds == Bounds(2, 2, 6, movable=True)
+    show = Show(cast)
+    show.take(Scene(1, 2, (Event(2, "move", thing="agent", which=1, place=(5.0, 7.0)),)))
+    frames = [show.frame(t)["main"] for t in range(6)]
+    assert [frame["over"] for frame in frames] == [False] * 4 + [True] * 2 and frames[4] == frames[5]
+    assert (frames[2]["agents"]["x"][1], frames[2]["agents"]["y"][1]) == (5.0, 7.0)
+    assert 5.0 <= frames[3]["agents"]["x"][1] <= 5.1 and frames[0]["agents"]["radius"][0] > 0
 
 
 def test_any_task_can_be_watched(quick_start: None):

@@ -26,7 +26,7 @@ MOST_BYTES = 400_000
 HEARD = 1_000
 """Recorded episodes that the dictionary is counted in."""
 REPLAYED = 8
-_UNBOUNDED = 12
+UNBOUNDED = 12
 """Agents at the most for a network in which every agent looks at all others: its work grows with their cube."""
 
 
@@ -77,7 +77,7 @@ def _live(opened: TrainedRun) -> dict[str, Any] | None:
     rules: dict[str, Any] = {**known}
     apart = "most_agents" not in rules
     if not apart and network["settings"]["nearest_agents"] is None:
-        rules["most_agents"] = max(_UNBOUNDED, env.num_agents)
+        rules["most_agents"] = max(UNBOUNDED, env.num_agents)
     talks = network["settings"]["communication"] != "none"
     heard = _episodes(opened, HEARD) if talks else []
     return {

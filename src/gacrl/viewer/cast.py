@@ -13,6 +13,8 @@ from gacrl.config.checks import require
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.errors import UserError
 from gacrl.evaluation import references
+from gacrl.export.html import UNBOUNDED
+from gacrl.export.replays import STEPS
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
 from gacrl.tasks.task import Task
@@ -23,12 +25,8 @@ from gacrl.types import Learner, Memory, Policy
 from gacrl.viewer.requests import Bounds
 from gacrl.viewer.rooms import Room
 
-MOST_STEPS = 1000
-"""Of an episode that is shown."""
 _LADDER = (8, 32)
 """Places of the rooms for other numbers of agents than the task's own; the largest has the most that may come."""
-_UNBOUNDED = 12
-"""Agents at the most for a network in which every agent looks at all others: its work grows with their cube."""
 
 Change = Callable[[Any], Any]
 Warn = Callable[[str], None]
@@ -246,7 +244,7 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
     if not _resizes(opened):
         player.most = player.home
     elif player.nearest is None:
-        player.most = max(_UNBOUNDED, player.home)
+        player.most = max(UNBOUNDED, player.home)
     return player
 
 
@@ -279,7 +277,7 @@ def _bounds(players: tuple[Player, ...]) -> Bounds:
     return Bounds(
         least=least,
         most=most,
-        length=min(int(first.task.make(first.settings).max_cycles), MOST_STEPS),
+        length=min(int(first.task.make(first.settings).max_cycles), STEPS),
         rounds=max(0 if words is None else words[0] for words in said),
         vocabulary=max(player.vocabulary for player in players),
         movable=first.task.edit is not None,

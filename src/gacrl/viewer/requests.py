@@ -67,7 +67,7 @@ class Event(NamedTuple):
     edge: tuple[int, int] = (-1, -1)
     on: bool = False
     thing: str = ""
-    index: int = -1
+    which: int = -1
     place: tuple[float, float] = (0.0, 0.0)
 
 
@@ -245,9 +245,9 @@ def _cut(fields: _Fields, bounds: Bounds) -> Event:
 
 def _move(fields: _Fields, bounds: Bounds) -> Event:
     _require(bounds.movable, "nothing can be moved in this task")
-    thing, index = fields.one_of("thing", ("agent", "mark")), fields.whole("index", 0, 9_999)
+    thing, which = fields.one_of("thing", ("agent", "mark")), fields.whole("index", 0, 9_999)
     place = fields.number("x", -FAR, FAR), fields.number("y", -FAR, FAR)
-    return Event(0, "", thing=thing, index=index, place=place)
+    return Event(0, "", thing=thing, which=which, place=place)
 
 
 def _team(fields: _Fields, bounds: Bounds) -> Event:

@@ -96,7 +96,8 @@ class Room:
 
     def reset(self, params: EnvParams, seed: int) -> Stood:
         """Begin an episode."""
-        return Stood(*self._reset(params, seed), self.memory, True)
+        state, seen = self._reset(params, seed)
+        return Stood(state, seen, self.memory, True)
 
     def fresh(self, params: EnvParams, seed: int, t: int) -> EnvState:
         """Return the state of another start, out of which newcomers come in step t."""
@@ -148,7 +149,7 @@ class Room:
                 replaced=np.zeros((rounds, agents), bool),
                 other=np.arange(agents),
                 kept=np.ones((agents, agents), bool),
-                radius=np.float32(0.0),
+                radius=0.0,
             )
             self.decide(learner, params, stood, 0, 2, meddling)
         if self._edit is not None:
@@ -232,14 +233,14 @@ def _decide(
 
 def _arrives(state: Meddling, ask: Callable[[Arrives], Array], first: Array, key: PRNGKey) -> Arrives:
     """Let words arrive round by round: what is said in a round depends on what was heard in the one before."""
-    values, replaced, places = state.values, state.replaced, jnp.arange(state.other.shape[1])
-    swapped = state.other != places[None]
+    values, replaced, other, kept = map(jnp.asarray, (state.values, state.replaced, state.other, state.kept))
+    swapped = other != jnp.arange(other.shape[1])[None]
     for number in range(values.shape[1]):
-        said = ask(Arrives(values, replaced, state.kept))[:, number]
-        theirs = jnp.take_along_axis(said, state.other[..., None], axis=1)
+        said = ask(Arrives(values, replaced, kept))[:, number]
+        theirs = jnp.take_along_axis(said, other[..., None], axis=1)
         values = values.at[:, number].set(jnp.where(swapped[..., None], theirs, values[:, number]))
         replaced = replaced.at[:, number].set(replaced[:, number] | swapped)
-    return Arrives(values, replaced, state.kept)
+    return Arrives(values, replaced, kept)
 
 
 _MEDDLING = Intervention("meddling", _arrives)

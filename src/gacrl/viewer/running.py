@@ -1,7 +1,5 @@
 """A live page from its names to its end: the socket, the server, and what goes on beside it."""
 
-import contextlib
-import os
 import secrets
 import socket
 import threading
@@ -17,6 +15,9 @@ from gacrl.viewer.guard import Guard
 from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
+
+_FIRST_PICTURE = 30.0
+"""Seconds that the compiler waits for a visitor, who would otherwise wait for it."""
 
 
 def new_token() -> str:
@@ -109,10 +110,9 @@ def warm_up(cast: Cast) -> None:
         player.room(player.home).warm(player.learner, player.params(player.home, player.home))
 
 
-def warm_up_the_rest(cast: Cast) -> None:
-    """Compile the rooms for other numbers of agents, smallest first, at a low priority."""
-    with contextlib.suppress(AttributeError, OSError):  # where threads have a priority of their own
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+def warm_up_the_rest(cast: Cast, shown: threading.Event) -> None:
+    """Compile the rooms for other numbers of agents, smallest first, once a first picture is shown."""
+    shown.wait(_FIRST_PICTURE)
     for size in cast.players[0].sizes[1:]:
         for player in cast.players:
             player.room(size).warm(player.learner, player.params(size, size))

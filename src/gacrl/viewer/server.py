@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import sys
+import threading
 import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +26,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from gacrl.errors import UserError
 from gacrl.viewer.cast import Cast
 from gacrl.viewer.guard import Guard, same_site
-from gacrl.viewer.requests import Bounds, Frames, Refused, Wanted, read
+from gacrl.viewer.requests import Frames, Refused, Wanted, read
 from gacrl.viewer.show import Show
 
 MOST_VISITORS = 8
@@ -99,7 +100,7 @@ class Visit:
             if isinstance(asked, Wanted):
                 self._wanted, self._frames = asked, None
             elif self._wanted is not None and asked.version == self._wanted.version:
-                self._frames = asked
+                self._frames = _joined(self._frames, asked)
         self.news.set()
 
     @property
@@ -128,6 +129,13 @@ class Visit:
         self._frames = None
 
 
+def _joined(pending: Frames | None, asked: Frames) -> Frames:
+    """Return what is to be sent after another request: what was asked for before as well, where the two meet."""
+    if pending is None or not pending.first <= asked.first <= pending.last + 1:
+        return asked
+    return pending._replace(last=max(pending.last, asked.last))
+
+
 class Server:
     """The application, and who is connected to it."""
 
@@ -137,17 +145,14 @@ class Server:
         self._page = page
         self._stage = ThreadPoolExecutor(1, "stage")
         self.visitors = 0
+        self.shown = threading.Event()
+        """Somebody has seen a frame."""
         routes = [
             Route("/", self._get_page),
             Route("/favicon.ico", lambda request: Response(status_code=204)),
             WebSocketRoute("/live", self._live),
         ]
         self.app: ASGIApp = _Guarded(Starlette(routes=routes), guard)
-
-    @property
-    def bounds(self) -> Bounds:
-        """What numbers of messages must fit."""
-        return self.cast.bounds
 
     async def _get_page(self, request: HttpRequest) -> Response:
         return HTMLResponse(self._page(same_site(request.headers)))
@@ -191,6 +196,7 @@ class Server:
                 text = await self._played(visit)
                 if text is not None:
                     await self._send(socket, text)
+                    self.shown.set()
                 continue
             visit.news.clear()
             if not (visit.waits or visit.refusal):

@@ -33,7 +33,8 @@ class Moment(NamedTuple):
 
     room: Room
     places: int
-    count: int
+    team: int
+    """Agents that are there."""
     state: EnvState
     decided: Decided
     said: np.ndarray | None
@@ -106,7 +107,7 @@ class Lane:
             stood = player.room(places).reset(player.params(places, scene.count), scene.seed)
             return places, scene.count, stood, 0.0, dict.fromkeys(measures, 0.0), False
         before = self.moments[-1]
-        params = player.params(before.places, before.count)
+        params = player.params(before.places, before.team)
         stood, happened = before.room.step(params, before.state, before.decided, scene.seed, t - 1)
         happened = jax.device_get(happened)
         summed = player.summed
@@ -115,7 +116,7 @@ class Lane:
             for name, measure in player.measures.items()
         }
         earned, over = before.earned + float(happened.reward), bool(happened.over)
-        return before.places, before.count, stood, earned, measured, over
+        return before.places, before.team, stood, earned, measured, over
 
     def _resized(self, stood: Stood, places: int, count: int, now: int, t: int) -> tuple[int, Stood]:
         """Let agents come or go, in a larger room where this one has too few places."""
@@ -157,7 +158,7 @@ class Lane:
                     if word < symbols:
                         values[number, agent, word], replaced[number, agent] = 1.0, True
         radius = (self.player.reach or 0.0) if rules.radius is None else rules.radius
-        return Meddling(values, replaced, other, kept, np.float32(radius))
+        return Meddling(values, replaced, other, kept, float(radius))
 
     @property
     def _seed(self) -> int:
@@ -229,6 +230,6 @@ def _hand(here: Sequence[Event], places: int, count: int, room: Room, stood: Sto
     }
     for event in moves:
         positions, moved = groups[event.thing]
-        if event.index < (count if event.thing == "agent" else marks):
-            positions[event.index], moved[event.index] = event.place, True
+        if event.which < (count if event.thing == "agent" else marks):
+            positions[event.which], moved[event.which] = event.place, True
     return Edit(groups["agent"], groups["mark"])

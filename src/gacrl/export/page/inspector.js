@@ -18,7 +18,6 @@ export class Inspector {
   // About an agent in a frame; rules: what holds there.
   draw(frame, index, rules) {
     this.offer(frame.scene.agents.length, index);
-    if (this.listed !== this.page.dictionary) this.listWords();
     const lines = aboutAgent(frame, index, this.page, rules);
     const said = frame.scene.agents[index].there === false ? [] : frame.decision?.said ?? [];
     const words = said.map((round, r) => aboutWord(this.page.dictionary, index, r, round[index], this.page)).filter(Boolean);
@@ -50,7 +49,6 @@ export class Inspector {
 
   // All words that were recorded, the commonest first.
   listWords() {
-    this.listed = this.page.dictionary;
     const entries = [...this.page.dictionary].sort((a, b) => a.agent - b.agent || a.round - b.round || b.share - a.share);
     byId("dictionary").hidden = entries.length === 0;
     const told = entries.filter((entry) => entry.share >= 0.005).map((entry) => aboutWord(this.page.dictionary, entry.agent, entry.round, entry.symbol, this.page));

@@ -27,7 +27,7 @@ export async function open(page) {
 class Served extends Story {
   constructor(page, world, policy, start, events) {
     super(start, events, page.facts.radius);
-    Object.assign(this, { page, world, policy, length: world.length, names: page.facts.names, movable: page.facts.movable, reaches: page.facts.radius !== null });
+    Object.assign(this, { world, policy, length: world.length, names: page.facts.names, movable: page.facts.movable, reaches: page.facts.radius !== null });
     this.main = { frames: [] };
     this.twin = { frames: [] };
     this.fresh = 0;  // so many frames are of the scene as it is; later ones are on their way
@@ -113,6 +113,7 @@ class Served extends Story {
     this.heard = performance.now();
     this.revision += 1;
     if (main.over && (twin === null || twin.over)) this.length = t;
+    this.line.tell("");
     this.open();
   }
 }
@@ -163,7 +164,7 @@ class Line {
     } else if (message.kind === "learning") {
       session.revision += 1;
       drawLearning(message);
-    } else if (message.kind === "words") Object.assign(session.page, { dictionary: message.dictionary, yardsticks: message.yardsticks });
+    }
   }
 
   tell(says) {
