@@ -1,6 +1,7 @@
 """`gacrl talk` without a task: who learns, scores by hand, resumption, and learners that were trained before."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -195,7 +196,9 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
         (["--env", "spread", "--env.num-agents", "1"], "spread has a single agent: nobody is there to talk to"),
     ],
 )
-def test_mistakes_end_in_one_sentence(words: list[str], sentence: str, said, tmp_path: Path):
+def test_mistakes_end_in_one_sentence(
+    words: list[str], sentence: str, said: Callable[..., tuple[int, str]], tmp_path: Path
+):
     code, error = said("talk", *words, "--out", tmp_path / "out")
     assert code == 2 and sentence in error and len(error.splitlines()) == 1
     assert not (tmp_path / "out").exists()
