@@ -177,7 +177,7 @@ def of_tasks(names: list[str], rounds: int, core: int) -> dict[str, dict[str, li
                 [side.ask(num_envs=size, task=name) if side else None for side in (us, peer)]
                 for _ in range(rounds)
             ]
-            mine, theirs = ([size / pair[k] for pair in pairs if pair[k]] for k in (0, 1))
+            mine, theirs = ([size / took for pair in pairs if (took := pair[k])] for k in (0, 1))
             print(f"{name:16} {size:6,} environments: ours {peers.spread(mine)} steps/s", flush=True)
             if len(theirs) == len(mine) == rounds:
                 found = [us / them for us, them in zip(mine, theirs, strict=True)]

@@ -14,7 +14,8 @@ from gacrl.config import presets
 from gacrl.config.algorithms import GacrlConfig
 from gacrl.config.run import RunConfig
 from gacrl.experiments import ablate
-from gacrl.experiments.ablate import FULL, YOKED, parts_of, plan
+from gacrl.experiments.ablate import FULL, plan
+from gacrl.experiments.parts import YOKED, parts_of, usual_preset
 from gacrl.experiments.study import Planned
 from gacrl.experiments.worth import remarkable, worths
 from gacrl.tasks.spread.settings import METRICS
@@ -56,6 +57,21 @@ def test_each_run_differs_from_the_whole_in_its_part_alone(planned: dict[str, Pl
         assert changed <= {*part.changes.get("algorithm", {}), "yoked_progress"}
         assert (config.env != whole.env) == ("env" in part.changes)
         assert config.training == whole.training
+
+
+def test_what_talks_has_parts_of_its_own(tmp_path: Path):
+    """A told critic among them; agents without messages have nobody whom it could teach to talk."""
+    talking = configuration.on_task(presets.preset(usual_preset("reference")), "reference")
+    assert (talking.preset, usual_preset("spread"), usual_preset(None)) == (
+        "gacrl-talk",
+        "gacrl-112k",
+        "gacrl-112k",
+    )
+    known = parts_of(talking)
+    assert set(known) - set(PARTS) == {"untold-critic"} and "no-coverage-bonus" not in known
+    assert {"no-heard-slope", "blunt-look", "warm-symbols", "no-logit-price"} < set(known)
+    runs = {run.name: run.config for run in plan(talking, tmp_path, ["no-messages", "soft-messages"])}
+    assert [run.algorithm.critic for run in runs.values()] == ["told", "central", "told"]
 
 
 def test_networks_without_a_part_are_about_as_large(planned: dict[str, Planned]):

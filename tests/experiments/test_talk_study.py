@@ -1,6 +1,7 @@
 """`gacrl talk` without a task: who learns, scores by hand, resumption, and learners that were trained before."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def settings() -> dict[str, RunConfig]:
 def test_learners_differ_by_what_they_hear_and_are_about_as_large(settings: dict[str, RunConfig]):
     assert "none-recurrent" not in settings, "nobody sees what others do"
     whole = kinds.num_parameters(settings["discrete"])
-    for name in ("told", "dial", "tarmac", "actions", "mappo"):
+    for name in ("dial", "mappo"):
         assert abs(kinds.num_parameters(settings[name]) - whole) < 0.05 * whole, name
     critics = {name: getattr(config.algorithm, "critic", None) for name, config in settings.items()}
     assert [name for name, critic in critics.items() if critic == "told"] == [
@@ -144,6 +145,7 @@ def test_scores_run_from_the_best_silent_policy_to_the_best_told_one(
     assert found.finals["told"][HEADLINE].tolist() == [-8.1, -8.0, -7.9] and "3 seeds from 0" in found.says
 
 
+@pytest.mark.soak
 def test_every_learner_may_try_as_many_learning_rates(trained: list[RunConfig], tmp_path: Path):
     """On seeds of their own; the best one trains on the seeds of the study, and nothing is tried again."""
     out = tmp_path / "tuned"
@@ -194,7 +196,9 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
         (["--env", "spread", "--env.num-agents", "1"], "spread has a single agent: nobody is there to talk to"),
     ],
 )
-def test_mistakes_end_in_one_sentence(words: list[str], sentence: str, said, tmp_path: Path):
+def test_mistakes_end_in_one_sentence(
+    words: list[str], sentence: str, said: Callable[..., tuple[int, str]], tmp_path: Path
+):
     code, error = said("talk", *words, "--out", tmp_path / "out")
     assert code == 2 and sentence in error and len(error.splitlines()) == 1
     assert not (tmp_path / "out").exists()

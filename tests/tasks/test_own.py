@@ -76,6 +76,14 @@ def test_the_fields_of_a_dataclass_are_its_settings():
         gacrl.make_env("Walk", stat=3)
 
 
+def test_a_page_names_a_file_as_it_was_given(monkeypatch: pytest.MonkeyPatch):
+    """What resumes a run must find the file from anywhere; a page is read on another machine."""
+    monkeypatch.chdir(BEACON.parent)
+    name, _ = own.bring(f"{BEACON.name}:Beacon")
+    assert tasks.flag(name) == f" --env {BEACON.absolute()}:Beacon"
+    assert tasks.flag(name, as_given=True) == f" --env {BEACON.name}:Beacon"
+
+
 def test_one_of_ours_stays_ours():
     env = gacrl.make_env("spread", num_agents=4)
     name, settings = own.bring(env)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gacrl import tasks
+from gacrl.algorithms.actions import choices
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.evaluation import references
@@ -19,6 +20,7 @@ from gacrl.experiments.study import Planned, reading, why_diverged
 from gacrl.experiments.talking.kinds import NONE, SILENT, TOLD, num_parameters
 from gacrl.messages import interventions
 from gacrl.messages.bits import bits_sent
+from gacrl.networks.agent import matched
 from gacrl.tasks.task import MATTERS, Case, Task
 from gacrl.tasks.task import SILENT as SILENTLY
 from gacrl.tasks.task import TOLD as KNOWING
@@ -237,4 +239,5 @@ def _bits(config: RunConfig) -> float | None:
     network = config.algorithm.network
     if network.communication in (NONE, TOLD):
         return None
-    return bits_sent(tasks.find(config.task).make(config.env), network)
+    env = tasks.find(config.task).make(config.env)
+    return bits_sent(env, matched(env, network, choices(env).size))
