@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak cluster plain-path lint types bench bench-short release lock clean
+.PHONY: train test soak cluster plain-path lint types docs bench bench-short release lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train

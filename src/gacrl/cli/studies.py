@@ -143,7 +143,7 @@ def _print_scores(done: "TalkOfAll") -> None:
     """Print the scores of all tasks and kinds."""
     from gacrl.cli.terminal import console
     from gacrl.experiments.talking import report
-    from gacrl.report.screen import print_table
+    from gacrl.report.tables import print_table
 
     title = "scores: 0 as the best silent policy, 1 as the best one that is told everything"
     print_table(console(), ("", *done.cases), report.scores(done.cases), title)
