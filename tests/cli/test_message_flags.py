@@ -70,7 +70,8 @@ def test_without_a_flag_nothing_is_done(
     assert main(["evaluate", str(tiny_run.folder), *EVALUATED, "--json"]) == 0
     title, *_, last = capsys.readouterr().out.splitlines()
     assert "episodes of 6 steps; mean over seeds" in title
-    assert "intervention" not in json.loads(last)
+    scores = json.loads(last)
+    assert "intervention" not in scores and scores["versions"]["jax"]
 
 
 def test_a_film_says_what_was_done(tiny_run: TinyRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
