@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,7 +60,11 @@ def test_runs_of_other_horizons_stand_in_one_table(
     ]
     assert main(["compare", str(short), str(long), *words, "--json"]) == 0
     said = capsys.readouterr()
-    assert said.err == f"gacrl: playing {long} again, over 4 steps\n"
+    first, *others = said.err.splitlines()
+    assert first == f"gacrl: playing {long} again, over 4 steps"
+    assert [line.rpartition(" of ")[2] for line in others] == ["steps-4 for the page", "steps-6 for the page"]
+    shown = (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8")
+    assert set(re.findall(r'"steps":(\d+)', shown)) == {"4"}, "the episodes to look at are as long"
     data = json.loads(said.out.splitlines()[-1])
     own = json.loads((short / "summary.json").read_text(encoding="utf-8"))
     values = [group["metrics"]["return_agent_mean"]["values"] for group in data["groups"]]
@@ -76,7 +81,7 @@ def test_runs_of_other_horizons_stand_in_one_table(
     assert any(note.startswith("played again over 4 steps, and without a curve") for note in data["notes"])
     with table.open(newline="") as file:
         assert {row["stage"] for row in csv.DictReader(file) if row["run"] == str(long)} == {"closing"}
-    assert f"gacrl compare {short} {long} --horizon 4<" in (tmp_path / "page" / "comparison.html").read_text()
+    assert f"gacrl compare {short} {long} --horizon 4 --metric return_agent_mean" in shown, "what was typed"
 
 
 def test_a_horizon_that_all_have_plays_nothing(runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str]):

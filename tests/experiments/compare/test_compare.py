@@ -473,9 +473,9 @@ def test_no_number_is_cut_on_a_narrow_screen(
 
 
 def command(*words: object, **env: str) -> "subprocess.Popen[bytes]":
-    """The command in a process of its own."""
+    """The command in a process of its own, which loads no jax."""
     return subprocess.Popen(
-        [sys.executable, "-m", "gacrl", "compare", *map(str, words)],
+        [sys.executable, "-m", "gacrl", "compare", "--no-replays", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={**os.environ, **env},
