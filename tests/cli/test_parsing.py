@@ -86,7 +86,8 @@ def test_flags_are_those_of_help(capsys: pytest.CaptureFixture[str]):
     flags = parsing._flags(arguments.Evaluate, None)
     assert (
         set(flags)
-        == {"--episodes", "--horizon", "--backend", "--num-agents", "--json", "--env", "--use"} | MESSAGES
+        == {"--episodes", "--horizon", "--backend", "--num-agents", "--utter", "--json", "--env", "--use"}
+        | MESSAGES
     )
     assert all(flag in said for flag in flags)
     known = parsing._flags(arguments.Train, arguments.Train(arguments.Settings.of(presets.preset("ippo"))))

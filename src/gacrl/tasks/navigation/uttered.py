@@ -20,9 +20,8 @@ def uttered(env: Navigation, policy: Policy) -> tuple[Navigation, Policy]:
     where the task has none, and, called, where the agents say anything but one symbol a step that is an utterance.
     """
     rules, num_agents = env.rules, env.num_agents
-    require(
-        rules.words > 0 and not env.utters, "symbols can be uttered where they are no actions yet, and could be"
-    )
+    require(rules.words > 0, "this task has no utterances among its actions: leave --utter out")
+    require(not env.utters, "utterances are among the actions of this policy already: leave --utter out")
     begin = env.vectors + rules.landmarks
     end = begin + rules.words * (num_agents - 1)
     speaks = jnp.asarray(rules.speaks)
