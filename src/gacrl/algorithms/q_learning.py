@@ -338,11 +338,13 @@ def look(q: Setup, pair: Pair, steps: Experience, keys: Array) -> Looks:
     memory = jax.tree.map(lambda leaf: leaf[0], steps.memory)
     if q.config.augment:  # what is remembered is not turned
         memory = jax.tree.map(jnp.zeros_like, memory)
-    pupil, now = None, jax.tree.map(lambda leaf: leaf[:learned], (seen, heard))
+    pupil = None
     if network.teacher is not None:
-        pupil = along(network.agent, now[1], memory, keys, pair.temperature)[0]
+        now = jax.tree.map(lambda leaf: leaf[:learned], heard)
+        pupil = along(network.agent, now, memory, keys, pair.temperature)[0]
     if q.forgetful:
-        return Looks(along(network.judge, now[0], (), keys, pair.temperature), None, pupil)
+        now = jax.tree.map(lambda leaf: leaf[:learned], seen)
+        return Looks(along(network.judge, now, (), keys, pair.temperature), None, pupil)
     # What a teacher remembers is not kept.
     before = memory if network.teacher is None else jax.tree.map(jnp.zeros_like, memory)
     online = along(network.judge, seen, before, keys, pair.temperature)

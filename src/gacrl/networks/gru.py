@@ -124,7 +124,7 @@ def _unroll_back(kept: Any, gradient: Array) -> tuple[Recurrent, Gates, None, Ar
         weight = jnp.tensordot(through, before, axes=(rows, rows))
         return eqx.tree_at(lambda it: (it.weight, it.bias), linear, (weight, through.sum(rows)))
 
-    reset, update, new = map(gradients, recurrent, through)
+    reset, update, new = (gradients(linear, s) for linear, s in zip(recurrent, through, strict=True))
     return (reset, update, new), sums, None, first
 
 
