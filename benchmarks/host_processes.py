@@ -1,18 +1,21 @@
 """A heavy PettingZoo environment over several processes, beside one: what a chunk of training takes.
 
-    python benchmarks/host_processes.py [--json] [MILLISECONDS] [PROCESSES]
+    python benchmarks/host_processes.py [--json] [--waiting] [MILLISECONDS] [PROCESSES]
 
 The environment is MPE2's `simple_spread_v3`, with so many milliseconds of Python's arithmetic in each step (2 by
-default). One and several processes (2 by default) take turns, in pairs; the preset is `ippo` with 16 environments.
-Prints environment steps a second of wall time: on busy cores the ratio is less than on idle ones.
+default). With --waiting it waits so long, as for a simulator elsewhere, which shows the overlap on busy cores too. One
+and several processes (2 by default) take turns, in pairs; the preset is `ippo` with 16 environments. Prints
+environment steps a second of wall time: on busy cores the ratio is less than on idle ones.
 """
 
 import json
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -27,17 +30,17 @@ PAIRS = 7
 
 
 class Heavy:
-    """Counts in Python before every step, for as long as that takes on an idle core."""
+    """Works before every step."""
 
-    def __init__(self, env: Any, rounds: int):
-        self._env, self._rounds = env, rounds
+    def __init__(self, env: Any, work: Callable[[], Any]):
+        self._env, self._work = env, work
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
 
     def step(self, actions: Any) -> Any:
-        """Count, then step."""
-        count(self._rounds)
+        """Work, then step."""
+        self._work()
         return self._env.step(actions)
 
 
@@ -56,10 +59,9 @@ def rounds_of(milliseconds: float) -> int:
     return round(1_000_000 * milliseconds / 1e3 / (time.process_time() - begun))
 
 
-def paces(milliseconds: float, processes: int) -> dict[int, list[float]]:
+def paces(work: Callable[[], Any], processes: int) -> dict[int, list[float]]:
     """Return steps a second of each pair's two turns, by the number of processes."""
-    rounds = rounds_of(milliseconds)
-    task = gacrl.from_pettingzoo(lambda: Heavy(simple_spread_v3.parallel_env(), rounds), "heavy", max_cycles=25)
+    task = gacrl.from_pettingzoo(lambda: Heavy(simple_spread_v3.parallel_env(), work), "heavy", max_cycles=25)
     name, settings = own.bring(task)
     config = replace(gacrl.preset("ippo"), task=name, env=settings)
     found: dict[int, list[float]] = {1: [], processes: []}
@@ -81,9 +83,11 @@ def paces(milliseconds: float, processes: int) -> dict[int, list[float]]:
 
 if __name__ == "__main__":
     prepare_jax()
-    numbers = [word for word in sys.argv[1:] if word != "--json"]
+    numbers = [word for word in sys.argv[1:] if not word.startswith("--")]
     milliseconds, processes = float(numbers[0]) if numbers else 2.0, int(numbers[1]) if numbers[1:] else 2
-    found = paces(milliseconds, processes)
+    waiting = "--waiting" in sys.argv
+    work = partial(time.sleep, milliseconds / 1e3) if waiting else partial(count, rounds_of(milliseconds))
+    found = paces(work, processes)
     ratios = [many / one for one, many in zip(found[1], found[processes], strict=True)]
     for over, turns in found.items():
         print(f"{over} processes: {', '.join(f'{pace:,.0f}' for pace in turns)} steps/s")

@@ -94,7 +94,11 @@ class _Hand:
 
     def ended(self) -> str:
         """How it ended."""
-        code = self.process.wait(_PATIENCE)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(_PATIENCE)
+        code = self.process.returncode
+        if code is None:
+            return "answers no more"
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
 
