@@ -223,7 +223,7 @@ def test_mistakes_end_in_a_sentence(
         ((empty, "--port", 0), "every checkpoint in"),
         (("oracle", "random", "noop", "--port", 0), "one policy or two, not 3"),
         (("pretrained:gacrl", "pretrained:gacrl-reference", "--port", 0), "does not play spread"),
-        (("told", "--port", 0), "told"),
+        (("told", "--port", 0), "told is no policy of spread: name its task with --env TASK"),
     ):
         code, told = said("view", *words)
         assert code == 2 and sentence in told and told.count("\n") == 1, (words, told)
