@@ -10,11 +10,16 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from serving import TOKEN, Site, Visitor, cast_of, memory, serving
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
+from gacrl import play
+from gacrl.training.build import Plan
+from gacrl.viewer.beside import page_beside
 from gacrl.viewer.following import learning
 from gacrl.viewer.guard import Guard
 from gacrl.viewer.server import MOST_VISITORS
@@ -124,8 +129,8 @@ def test_eight_pages_at_once_and_no_more(reference: Site):
     until(lambda: reference.running.server.visitors == 0)
 
 
-def until(done: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
+def until(done: Callable[[], bool], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -207,6 +212,26 @@ def test_what_is_put_up_reaches_who_comes_later(reference: Site):
     reference.board.notes.clear()
 
 
+@pytest.mark.soak
+def test_a_training_has_a_page_of_its_own_process(quick_start: None):
+    """It opens once there is a checkpoint, answers as any page, and ends with the training."""
+    said: list[str] = []
+    folder, opened = play.folder_of("pretrained:gacrl-reference"), play.open_one("pretrained:gacrl-reference")
+    with page_beside("127.0.0.1", 0, {}, said.append) as watcher:
+        watcher.planned(folder, opened.config, Plan(1, 1, 1, ("cpu:0",), 2, 25, ()))
+        address = said[0].split()[1]
+        until(lambda: said[-1].endswith("is open"), 240)
+        path = address.replace("http", "ws").replace("/?", "/live?")
+        with connect(path, open_timeout=60) as line:
+            visitor = Visitor(line)
+            visitor.scene(1, 2)
+            assert visitor.frames(0, 25)[-1]["main"]["over"]
+        host, port = urlsplit(address).netloc.split(":")
+    with pytest.raises(OSError):
+        socket.create_connection((host, int(port)), 5)
+    assert len(said) == 2
+
+
 def test_mistakes_end_in_a_sentence(
     said: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: Site
 ):
@@ -223,7 +248,7 @@ def test_mistakes_end_in_a_sentence(
         ((empty, "--port", 0), "every checkpoint in"),
         (("oracle", "random", "noop", "--port", 0), "one policy or two, not 3"),
         (("pretrained:gacrl", "pretrained:gacrl-reference", "--port", 0), "does not play spread"),
-        (("told", "--port", 0), "told"),
+        (("told", "--port", 0), "told is no policy of spread: name its task with --env TASK"),
     ):
         code, told = said("view", *words)
         assert code == 2 and sentence in told and told.count("\n") == 1, (words, told)

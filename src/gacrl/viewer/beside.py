@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from gacrl.config.run import RunConfig
 from gacrl.training.build import Plan
@@ -46,7 +46,7 @@ def page_beside(
             child = _start({**asked, "socket": listener.fileno()}, listener)
             ending.callback(_end, child)
             say(f"page       {address} after the first evaluation")
-            threading.Thread(target=_relay, args=(child.stdout, say), daemon=True).start()
+            threading.Thread(target=_relay, args=(child, say), daemon=True).start()
 
         yield Watcher(planned=planned)
 
@@ -68,9 +68,12 @@ def _start(asked: Mapping[str, Any], listener: socket.socket) -> "subprocess.Pop
     return child
 
 
-def _relay(lines: IO[str], say: Callable[[str], None]) -> None:
-    for line in lines:
-        say(line.rstrip("\n"))
+def _relay(child: "subprocess.Popen[str]", say: Callable[[str], None]) -> None:
+    """Pass on what the child says, until its end."""
+    assert child.stdout is not None
+    with child.stdout as lines:
+        for line in lines:
+            say(line.rstrip("\n"))
 
 
 def _end(child: "subprocess.Popen[str]") -> None:

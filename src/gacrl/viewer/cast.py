@@ -1,8 +1,9 @@
 """Who plays on a live page, and in what: one policy or two of the same task, named on the command line alone."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -176,18 +177,21 @@ def open_cast(
     """
     require(1 <= len(names) <= 2, f"a page shows one policy or two, not {len(names)}")
     known = references.playable(tasks.find(task))
-    first = next((name for name in names if name not in known and not _scripted_elsewhere(name)), None)
-    opened = None if first is None else play.open_one(first, change, warn)
-    found = tasks.find(task) if opened is None else opened.task
-    settings = change(tasks.default_settings(task)) if opened is None else opened.config.env
+    first = next((name for name in names if name not in known and not _only_scripted(name)), None)
+    runs = {} if first is None else {first: play.open_one(first, change, warn)}
+    if first is None:
+        found, settings = tasks.find(task), change(tasks.default_settings(task))
+    else:
+        found, settings = runs[first].task, runs[first].config.env
     _require_shown(found, settings)
-    players = tuple(_player(name, found, settings, opened, sampled, warn) for name in names)
+    players = tuple(_player(name, found, settings, runs, sampled, warn) for name in names)
     return Cast(players, _bounds(players))
 
 
-def _scripted_elsewhere(name: str) -> bool:
-    """Whether some task at hand has a scripted policy of this name: it may be the run's."""
-    return any(name in references.playable(tasks.find(task)) for task in tasks.names())
+def _only_scripted(name: str) -> bool:
+    """Whether this is the name of no run, but of a scripted policy of some task: it may be the run's."""
+    scripts = (references.playable(tasks.find(task)) for task in tasks.names())
+    return not Path(name).exists() and any(name in script for script in scripts)
 
 
 def _require_shown(task: Task, settings: Any) -> None:
@@ -199,16 +203,20 @@ def _require_shown(task: Task, settings: Any) -> None:
         raise UserError(f"{task.name} does not say where things are: give its observations positions, or a scene")
 
 
-def _player(name: str, task: Task, settings: Any, opened: TrainedRun | None, sampled: bool, warn: Warn) -> Player:
+def _player(
+    name: str, task: Task, settings: Any, runs: Mapping[str, TrainedRun], sampled: bool, warn: Warn
+) -> Player:
+    """Open one policy. runs: those that are open already."""
+    if name in runs:
+        return trained(runs[name], name, sampled)
     if name in references.playable(task):
         return scripted(name, task, settings)
-    if opened is None or opened.name != name:
-        require(
-            opened is None or play.folder_of(name).config().task == task.name,
-            f"{name} does not play {task.name}: two policies side by side need the same task",
-        )
-        opened = play.open_one(name, lambda _: settings, warn)
-    return trained(opened, name, sampled)
+    require(bool(runs), f"{name} is no policy of {task.name}: name its task with --env TASK")
+    require(
+        play.folder_of(name).config().task == task.name,
+        f"{name} does not play {task.name}: two policies side by side need the same task",
+    )
+    return trained(play.open_one(name, lambda _: settings, warn), name, sampled)
 
 
 def scripted(name: str, task: Task, settings: Any) -> Player:
