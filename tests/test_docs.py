@@ -81,7 +81,7 @@ def test_modules_that_the_documents_name_exist(page: Path):
     """As a path from one of the folders or as a tail of one; what an older house had is in the log."""
     here = {
         str(path.relative_to(ROOT))
-        for folder in ("src", "tests", "benchmarks", "examples")
+        for folder in ("src", "tests", "benchmarks", "examples", "docs")
         for path in (ROOT / folder).rglob("*.py")
     }
     for named in set(re.findall(r"[`( ]([\w/]+\.py)\b", page.read_text(encoding="utf-8"))) - {"FILE.py"}:
