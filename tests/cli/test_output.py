@@ -78,7 +78,7 @@ def test_a_reader_that_has_gone_ends_no_command(
     unbuffered: str,
     run: Callable[..., subprocess.CompletedProcess[bytes]],
 ):
-    for words in (("train", "--help"), ("compare", tiny_run.folder, "--out", "page")):
+    for words in (("train", "--help"), ("compare", tiny_run.folder, "--no-replays", "--out", "page")):
         reader, writer = os.pipe()
         os.close(reader)
         done = run(*words, out=writer, PYTHONUNBUFFERED=unbuffered)
@@ -92,7 +92,7 @@ def test_output_that_cannot_be_written_is_told_when_all_is_done(
     tiny_run: TinyRun, tmp_path: Path, run: Callable[..., subprocess.CompletedProcess[bytes]]
 ):
     with Path("/dev/full").open("wb") as full:
-        done = run("compare", tiny_run.folder, "--out", "page", out=full)
+        done = run("compare", tiny_run.folder, "--no-replays", "--out", "page", out=full)
     assert done.returncode == 2
     assert done.stderr == b"gacrl: cannot use standard output: No space left on device\n"
     assert (tmp_path / "page" / "comparison.html").is_file()

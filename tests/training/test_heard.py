@@ -184,18 +184,15 @@ def test_the_replay_of_q_learning_holds_what_arrived_and_windows_hear_it(name: s
 
     @jax.jit
     def values(stored: Any) -> Any:
-        def of_one(transition: Any, memory: Any) -> Any:
-            first = jax.tree.map(lambda leaf: leaf[0], memory)
-            temperature = q.explorer.level(learner.exploration, learner.env_steps).temperature
-            output, _ = q_learning.along(learner.network.agent, transition, first, None, temperature)
+        first = jax.tree.map(lambda leaf: leaf[0], stored.memory)
+        temperature = q.explorer.level(learner.exploration, learner.env_steps).temperature
+        output, _ = q_learning.along(learner.network.agent, stored.transition, first, None, temperature)
 
-            def value(output: Any, seen: Any) -> Any:
-                best = q_learning.greedy(output.head, q.actions.mask(seen.action_mask))
-                return q.parts.team_value(learner.network, output, best, seen).mean()
+        def value(output: Any, seen: Any) -> Any:
+            best = q_learning.greedy(output.head, q.actions.mask(seen.action_mask))
+            return q.parts.team_value(learner.network, output, best, seen).mean()
 
-            return jax.vmap(value)(output, transition.observation)
-
-        return jax.vmap(of_one, 1, 1)(stored.transition, stored.memory)
+        return jax.vmap(jax.vmap(value))(output, stored.transition.observation)
 
     acted = steps.decision.extras["value"][..., 0]
     np.testing.assert_allclose(values(stored), acted, rtol=1e-4, atol=1e-5)

@@ -87,7 +87,7 @@ BASELINES = {
     "qmix": (q_learning(QmixConfig, mixer_width=8), 100),
     "vdn": (q_learning(VdnConfig), 100),
     "iql": (q_learning(IqlConfig), 100),
-    "dial": (q_learning(DialConfig, network=DIAL, sequence_length=2), 150),
+    "dial": (q_learning(DialConfig, network=DIAL, sequence_length=2), 200),
 }
 SOLVED = {"commnet": ("message", "late_message"), "dial": ("late_message",)}
 """Of the probes that take a message: DIAL's is heard a step after it was said."""
