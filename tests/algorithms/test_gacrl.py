@@ -76,15 +76,14 @@ def test_rewards_teach_the_teacher_and_the_teacher_the_agents():
     learner = jax.tree.map(lambda leaf: leaf[0], state.learner)
     q = trainer.algorithm.init.args[0]  # pyright: ignore[reportFunctionMemberAccess] a partial
     unpack = ring.packing(partial(q_learning.example, q))[1]
-    window = jax.vmap(unpack)(learner.replay.items[: q.window, 0])
+    batch = jax.vmap(jax.vmap(unpack))(learner.replay.items[: q.window, :1])
 
     @jax.jit
     def slopes(network: Network) -> Any:
         def term(name: str) -> Any:
             def of(network: Network) -> jax.Array:
-                return q_learning.window_loss(q, network, learner, learner.rewards, window, jax.random.key(1))[1][
-                    name
-                ]
+                keys = jax.random.split(jax.random.key(1), 1)
+                return q_learning.loss(q, network, learner, learner.rewards, batch, keys)[1][name]
 
             return jax.grad(of)(network)
 

@@ -667,7 +667,7 @@ def test_the_command_writes_a_report_that_has_every_claim(
         "17.65, 0.16, 0.6",
     ):
         assert text in page, text
-    assert page.count("<figure class=\"plot\">") > 10
+    assert page.count('<figure class="plot">') > 10
     written = (out / "report.md").read_text(encoding="utf-8")
     order = ["### What was reproduced", "## Figures 2 to 4", "## Table III", "## Every test", "## Every verdict"]
     assert sorted(order, key=written.index) == order, "summary and figures come first, the long tables last"
