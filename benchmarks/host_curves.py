@@ -18,6 +18,7 @@ import numpy as np
 from gacrl import api
 from gacrl.evaluation.statistics import difference, mean
 from gacrl.training.devices import prepare_jax
+from gacrl.versions import versions
 
 TASKS = {"spread": "spread", "mpe2": "pettingzoo:mpe2.simple_spread_v3"}
 METRIC = "return_agent_mean"
@@ -52,6 +53,5 @@ if __name__ == "__main__":
     apart = difference(theirs, ours, mean)
     print(f"mpe2 {theirs.mean():.2f}, spread {ours.mean():.2f}; apart {apart}")
     if given.out is not None:
-        given.out.write_text(
-            json.dumps({"preset": "ippo", "seeds": list(range(given.seeds)), **curves}, indent=1) + "\n"
-        )
+        made = {"preset": "ippo", "seeds": list(range(given.seeds)), "versions": versions(), **curves}
+        given.out.write_text(json.dumps(made, indent=1) + "\n")

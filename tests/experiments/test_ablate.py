@@ -176,7 +176,7 @@ def test_the_command_says_what_each_part_is_worth(
     assert [versions["git_commit"] for versions in answer["versions"]] == ["c0ffee", "decade-dirty"]
     assert "0.701 [0.700, 0.702]" in page
     assert "<td>no-messages</td><td>may cost</td><td>collisions</td><td>0.200 [0.199, 0.201]" in page
-    assert page.count("<figure class=\"plot\">") == 4
+    assert page.count('<figure class="plot">') == 4
     assert (
         "gacrl ablate --preset gacrl-112k --seeds 3 --seed 0 --env-steps 112500 --updates 5 --part no-messages"
         in page

@@ -56,7 +56,7 @@ class Crew:
 
 def _pickled(recipe: Recipe) -> bytes:
     """The recipe with the functions in it, also those of a task's own file, which no other process can import."""
-    import cloudpickle  # comes with PettingZoo
+    import cloudpickle
 
     for name, module in list(sys.modules.items()):
         if name.startswith(tasks.OWN_FILE):
