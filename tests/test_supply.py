@@ -32,7 +32,7 @@ TALKS: dict[str, set[str]] = {
     "viewer/running.py": {"socket"},
     # A training and the processes that it has started, by a socket that nobody else has.
     "tasks/foreign/crew.py": {"socket", "cloudpickle"},
-    "tasks/foreign/worker.py": {"pickle", "socket"},
+    "tasks/foreign/worker.py": {"pickle"},
 }
 
 
