@@ -85,6 +85,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gacrl, "preset", small)
 
 
+@pytest.mark.soak
 def test_messages_of_your_own(example: Callable[[str], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """They are said, their loss is among the others, and any learner takes them by name."""
     few(monkeypatch)
@@ -120,6 +121,7 @@ def test_an_algorithm_of_your_own(example: Callable[[str], Any], tmp_path: Path,
     assert not list((run.folder / "checkpoints").glob("best-*/*optimizer*"))
 
 
+@pytest.mark.soak
 def test_a_tracker_of_your_own(example: Callable[[str], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """One row an evaluation, as in metrics.jsonl; it may stop the run."""
     few(monkeypatch)

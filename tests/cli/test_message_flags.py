@@ -139,6 +139,7 @@ def silent_run(tmp_path_factory: pytest.TempPathFactory, quick_start: dict[str, 
 
 @pytest.mark.parametrize("command", ["evaluate", "render"])
 @pytest.mark.parametrize("words", [["--silence"], ["--delay", "2"]], ids=" ".join)
+@pytest.mark.soak
 def test_who_says_nothing_cannot_be_changed(
     command: str,
     words: list[str],

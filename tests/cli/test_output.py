@@ -98,6 +98,7 @@ def test_output_that_cannot_be_written_is_told_when_all_is_done(
     assert (tmp_path / "page" / "comparison.html").is_file()
 
 
+@pytest.mark.soak
 def test_a_folder_of_any_name_and_the_time_on_the_wall(
     tmp_path: Path, run: Callable[..., subprocess.CompletedProcess[bytes]]
 ):

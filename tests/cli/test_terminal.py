@@ -78,6 +78,7 @@ def test_the_time_left_counts_what_follows_the_last_chunk(quick_references: None
     assert re.search(r"\(mean of 2 seeds\); [\d,]+ steps/s, \d+ s left$", standing(told[0]))
 
 
+@pytest.mark.soak
 def test_of_several_runs_it_says_which_of_how_many_and_how_long_all_will_take(
     quick_references: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -136,7 +136,7 @@ def in_node(folder: Path, script: str, data: dict[str, Any]) -> dict[str, Any]:
         lambda: shipped("gacrl-teams", num_agents=16, arena_scale=1.5),
         lambda: shipped("gacrl-reference"),
         pytest.param(lambda: shipped("gacrl-colours"), marks=pytest.mark.soak),
-        lambda: untrained("speaker_listener", {"latent": "none"}),
+        pytest.param(lambda: untrained("speaker_listener", {"latent": "none"}), marks=pytest.mark.soak),
         lambda: untrained("colours", {"speaker_identity": True}, graph="full", named=False),
     ],
     ids=["gacrl", "teams", "reference", "colours", "speaker_listener", "unnamed"],

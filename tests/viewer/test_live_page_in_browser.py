@@ -1,7 +1,5 @@
 """The live page in a real browser: it plays, listens to hands, and stays on the page when the server is lost."""
 
-import importlib.util
-import shutil
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -10,32 +8,15 @@ import numpy as np
 import pytest
 from serving import Site, cast_of, serving
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-PLAYWRIGHT = importlib.util.find_spec("playwright") is not None
-pytestmark = pytest.mark.skipif(
-    not CHROMIUM or not PLAYWRIGHT,
-    reason="the live page is looked at in Chromium by Playwright (apt-get install chromium; pip install playwright)",
-)
-
 
 @pytest.fixture(scope="module")
-def browser(quick_start: None) -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def reference(browser: Any) -> Iterator[Site]:
+def reference(quick_start: None) -> Iterator[Site]:
     with serving(cast_of("pretrained:gacrl-reference")) as site:
         yield site
 
 
 @pytest.fixture(scope="module")
-def teams(browser: Any) -> Iterator[Site]:
+def teams(quick_start: None) -> Iterator[Site]:
     with serving(cast_of("pretrained:gacrl-teams")) as site:
         yield site
 

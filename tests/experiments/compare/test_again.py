@@ -38,6 +38,7 @@ def runs(quick_start: dict[str, str], tmp_path_factory: pytest.TempPathFactory) 
     )
 
 
+@pytest.mark.soak
 def test_runs_of_other_horizons_stand_in_one_table(
     runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
