@@ -69,10 +69,13 @@ export class Voices {
 
   // Which words the visitor says: one for each round.
   mouth(agent, value) {
-    const { vocabulary } = this.page.network.settings;
+    const { vocabulary } = this.page.network.settings, said = [...value];  // of all rounds: a quick hand chooses two before they are drawn
     return value.map((symbol, round) => make("select", {
       "data-key": `say-${agent}-${round}`, "aria-label": `Your word of round ${round + 1} for agent ${agent}`, class: "mouth",
-      onchange: (event) => this.act.fate([agent], { kind: "speak", value: value.with(round, Number(event.target.value)) }),
+      onchange: (event) => {
+        said[round] = Number(event.target.value);
+        this.act.fate([agent], { kind: "speak", value: [...said] });
+      },
     }, ...Array.from({ length: vocabulary }, (_, k) => make("option", { value: k, selected: k === symbol }, letter(k)))));
   }
 }
