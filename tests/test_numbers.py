@@ -406,6 +406,7 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
     (RESULTS, r"full graph comes to ([^:]*):", each("talk-colours-full-gamma-10-seeds", SOLVED)),
+    (RESULTS, r"ends at .02, comes to ([^(]*) \(", each("talk-colours-full-16-steps-10-seeds", SOLVED)),
     (RESULTS, r"512 episodes, success ([^,]*),", each("talk-traffic-easy-3-seeds", "success")),
     (RESULTS, r"1.0 .986 .996, return ([^(]*)\n", each("talk-traffic-easy-3-seeds", RETURN)),
     (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
