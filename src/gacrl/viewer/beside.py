@@ -58,7 +58,7 @@ def _start(asked: Mapping[str, Any], listener: socket.socket) -> "subprocess.Pop
         stdout=subprocess.PIPE,
         text=True,
         pass_fds=(listener.fileno(),),
-        start_new_session=True,  # Ctrl-C is for the training
+        process_group=0,  # Ctrl-C is for the training; a session of its own would have its share whatever its priority
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
     assert child.stdin is not None
