@@ -184,7 +184,8 @@ def runs_python(block: str, names: dict[str, Any]) -> bool:
     try:
         exec(block, names)
     except (ImportError, gacrl.UserError) as error:
-        assert isinstance(error, ImportError) or "pip install" in str(error), block
+        foreign = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] != "gacrl"
+        assert foreign or "pip install" in str(error), block
         return False
     return True
 
