@@ -41,7 +41,6 @@ def test_anchors_are_what_the_scripted_policies_score(name: str):
         assert who in known["trained"], "there is a place for it"
 
 
-@pytest.mark.soak
 def test_score_talk_is_0_in_silence_and_1_where_all_is_told():
     talk = tasks.find("reference").known()["scores"]
     scores = scoring.score_run("random", 64, task="reference")

@@ -20,8 +20,8 @@ from gacrl.training.watching import Watcher
 pytestmark = pytest.mark.usefixtures("quick_start")
 
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
-FAMILIES = ("mappo",)
-"""For every change; the paper's is in test_resume.py, Q-learning in test_ahead.py, and `make soak` takes them all."""
+FAMILIES = ("vdn", "mappo")
+"""One of each learner, for every change; the paper's is in test_resume.py, and `make soak` takes them all."""
 ALL = [
     pytest.param(name, marks=[] if name in FAMILIES else [pytest.mark.soak])
     for name in PRESETS

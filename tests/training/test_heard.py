@@ -111,7 +111,7 @@ TALKS = {
 }
 
 
-@pytest.mark.parametrize("name", soaked(TALKS, "discrete, delay 2", "gated, noise 0.5"))
+@pytest.mark.parametrize("name", soaked(TALKS, "discrete, delay 2", "discrete, drop 0.4", "gated, noise 0.5"))
 def test_the_first_ratio_of_ppo_is_one_whatever_arrives(name: str):
     """The agents' words are drawn. Without what arrived, the ratio is another one."""
     network, text = TALKS[name]
@@ -216,7 +216,7 @@ SILENCED = {
 }
 
 
-@pytest.mark.parametrize("name", soaked(SILENCED, "mappo"))
+@pytest.mark.parametrize("name", soaked(SILENCED, "gacrl", "mappo"))
 def test_to_train_in_silence_is_to_train_where_no_edge_is(name: str):
     """Six updates: the same weights and metrics. With words they are others."""
 

@@ -38,7 +38,7 @@ def printed() -> ProbeResult:
     return probe_algorithm(GacrlPaperConfig(), 1_500)
 
 
-@pytest.mark.parametrize("probe", [pytest.param("action", marks=pytest.mark.soak), "both"])
+@pytest.mark.parametrize("probe", ["action", "both"])
 def test_it_learns_to_act(probe: str, printed: ProbeResult):
     assert printed.returns[probe] == BEST_RETURN[probe] == 1.0
 
