@@ -1,5 +1,6 @@
 """The functions of `import gacrl`: train, evaluate, and the loop in one's own hands."""
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ from gacrl.training.loop import Progress
 from gacrl.training.recorder import RunFolder
 from gacrl.training.telling import teller
 from gacrl.training.trackers.following import tracked
-from gacrl.training.trainer import ChunkReport, TrainState
+from gacrl.training.trainer import AbstractTrainer, ChunkReport, TrainState
 from gacrl.training.trainer import Trainer as CompiledTrainer
 from gacrl.training.watching import Watcher
 from gacrl.types import Arrives, Intervention, PRNGKey
@@ -147,7 +148,13 @@ def iterate(
     """
     config = settled(config, seed, env)
     trainer = build.make_trainer(config)
-    return loop.train(trainer, config, trainer.init(config.seeds))
+    return _closed_after(trainer, loop.train(trainer, config, trainer.init(config.seeds)))
+
+
+def _closed_after(trainer: AbstractTrainer, steps: Iterator[Progress]) -> Iterator[Progress]:
+    """The steps; processes that environments live in end with them."""
+    with contextlib.closing(trainer):
+        yield from steps
 
 
 class Trainer(NamedTuple):
