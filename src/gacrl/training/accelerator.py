@@ -13,7 +13,7 @@ KNOWN = jax.__version__.startswith(("0.10.", "0.11."))
 QUICKLY = "--xla_gpu_autotune_level=0 --xla_gpu_experimental_enable_fusion_autotuner=false"
 """XLA tries no variants of products and fusions of a few thousand numbers: that takes longer than it saves.
 
-On an H100 a cold start took 154 s with these flags and more than 186 s without (jax 0.11.2, docs/results.md). What the
+On an H100 the first alone took the compiling of ten seeds from 238 to 89 s (docs/results.md, "On a GPU"). What the
 autotuner found, where it is on, JAX keeps beside the compiled programs.
 """
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")

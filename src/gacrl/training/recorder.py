@@ -111,20 +111,22 @@ class RunFolder:
         source = self._made().get("source")
         return f"{name!r} of {source}" if source else repr(name)
 
-    def _made(self) -> dict[str, Any]:
-        """What is known of the task that the run was made in; nothing of a run of version 0.1.0."""
+    def _told(self) -> dict[str, Any]:
+        """What is known of how the run was made; nothing of a run of version 0.1.0."""
         try:
-            made = json.loads(self.origin_file.read_text(encoding="utf-8"))["task"]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            told = json.loads(self.origin_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
             return {}
+        return told if isinstance(told, dict) else {}
+
+    def _made(self) -> dict[str, Any]:
+        """What is known of the task that the run was made in."""
+        made = self._told().get("task")
         return made if isinstance(made, dict) else {}
 
     def begun_from(self) -> str | None:
         """Return the run that this one started from; None where it started from nothing, or does not say."""
-        try:
-            return json.loads(self.origin_file.read_text(encoding="utf-8")).get("from")
-        except (OSError, ValueError, AttributeError, RecursionError):
-            return None
+        return self._told().get("from")
 
     def warn_of_changed_task(self, warn: Callable[[str], None]) -> None:
         """Say that a task from outside is no longer what it was when the run was made. It goes on all the same."""

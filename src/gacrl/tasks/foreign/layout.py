@@ -195,12 +195,13 @@ def _acts(task: str, agent: str, space: Any) -> Choice | Reach:
         )
     sizes = [2] * int(np.prod(space.shape)) if kind == "MultiBinary" else np.ravel(space.nvec).tolist()
     starts = np.ravel(getattr(space, "start", np.zeros(len(sizes)))).astype(int).tolist()
-    if np.prod(sizes) > MOST_CHOICES or len(space.shape) != 1:
+    choice = Choice(tuple(sizes), tuple(starts), False)
+    if choice.count > MOST_CHOICES or len(space.shape) != 1:
         raise ConfigError(
-            f"{agent} of {task} has {int(np.prod(sizes))} actions, {' × '.join(map(str, sizes))}, and at most "
+            f"{agent} of {task} has {choice.count} actions, {' × '.join(map(str, sizes))}, and at most "
             f"{MOST_CHOICES} are taken apart: offer it fewer in a wrapper of the environment"
         )
-    return Choice(tuple(sizes), tuple(starts), False)
+    return choice
 
 
 def _reach(task: str, agent: str, space: Any) -> Reach:
