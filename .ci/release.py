@@ -74,7 +74,10 @@ def lowest() -> list[str]:
 
 
 def weigh(environment: Path) -> str:
-    """Return how much is installed beside pip and setuptools. Raises SystemExit where it is more than promised."""
+    """Return how many packages are installed beside pip and setuptools, and the size of all.
+
+    Raises SystemExit where it is more than promised.
+    """
     packages = {path.name.partition("-")[0] for path in environment.rglob("*.dist-info")} - {"pip", "setuptools"}
     size = sum(path.lstat().st_blocks * 512 for path in environment.rglob("*")) / 2**20  # pip's files too
     weight = f"{len(packages)} packages, {size:.0f} MB"

@@ -38,7 +38,8 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
 
 def seconds(command: tuple[str, ...], cache: Path) -> float:
     """One run of a command. Raises CalledProcessError where it fails."""
-    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(cache)
     gacrl = (sys.executable, "-m", "gacrl")
     with tempfile.TemporaryDirectory() as room:
         if "there" in command:

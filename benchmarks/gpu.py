@@ -25,8 +25,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import commands
 import lowered
 import peers
 import training
@@ -175,19 +177,9 @@ def measure(words: list[str], python: str) -> dict[str, Any]:
 
 def starts(small: bool) -> dict[str, float]:
     """Seconds of `gacrl train`, typed to prompt: cold, and warm."""
-    found: dict[str, float] = {}
-    with tempfile.TemporaryDirectory() as room:
-        for kind in ("cold", "warm"):
-            command = [sys.executable, "-m", "gacrl", "train", "--env-steps", "500" if small else "15000"]
-            begun = time.perf_counter()
-            subprocess.run(
-                [*command, "--out", f"{room}/{kind}"],
-                env={**os.environ, "XDG_CACHE_HOME": f"{room}/cache"},
-                check=True,
-                capture_output=True,
-            )
-            found[kind] = time.perf_counter() - begun
-    return found
+    command = ("train", "--env-steps", "500" if small else "15000", "--out", "here")
+    with tempfile.TemporaryDirectory() as cache:
+        return {kind: commands.seconds(command, Path(cache)) for kind in ("cold", "warm")}
 
 
 def told(name: str, found: dict[str, Any]) -> str:
