@@ -34,6 +34,22 @@ def fated(fates: dict[int, Fate]) -> tuple[Event, ...]:
     return tuple(Event(0, "fate", agent=agent, fate=fate) for agent, fate in fates.items())
 
 
+def test_the_untouched_lane_plays_with_the_parameters_of_the_other(
+    quick_start: None, monkeypatch: pytest.MonkeyPatch
+):
+    """A run that is being trained has newer ones from each new start on, and not from a silence on."""
+    cast = cast_of("pretrained:gacrl-reference")
+    show, player, kept = Show(cast), cast.players[0], cast.players[0].learner
+    whole = [(show.take(Scene(5, 2, ())), show.frame(t))[1]["main"]["agents"] for t in range(8)]
+    newer = jax.tree.map(lambda leaf: -leaf if jnp.ndim(leaf) == 2 else leaf, kept)  # weights
+    monkeypatch.setattr(player, "learner", newer)
+    show.take(Scene(5, 2, (Event(3, "fate", agent=1, fate=Fate("silence")),)))
+    assert [show.frame(t)["twin"]["agents"] for t in range(8)] == whole
+    show.take(Scene(5, 2, fated({1: Fate("silence")})))
+    assert show.frame(4)["twin"]["agents"] != whole[4]
+    assert show.main.learner is show.twin.learner is newer
+
+
 @pytest.mark.parametrize("case", soaked(CASES, "swap", "delay"))
 def test_what_happens_to_words_happens_as_in_evaluation(quick_start: None, case: str):
     cast = cast_of("pretrained:gacrl-reference")

@@ -53,22 +53,28 @@ class Lane:
         self.player, self.meddled, self._shift = player, meddled, shift
         self.moments: list[Moment] = []
         self.scene: Scene | None = None
-        self._learner: Learner = player.learner
+        self.learner: Learner = player.learner
         self._elsewhere = Lane(player, False, _ELSEWHERE) if meddled else None
-        self._size = 0.0
+        self.size = 0.0
 
     def take(self, scene: Scene) -> None:
         """Play this scene from now on, and keep what of it is known. A new start takes the newest parameters."""
+        seed = (scene.seed + self._shift) % MOST_SEED
+        mine = Scene(seed, scene.count, scene.events if self.meddled else untouched(scene))
+        same = 0 if self.scene is None else first_difference(self.scene, mine)
+        del self.moments[same:]
+        self.scene = mine
+        if not self.moments:
+            self.learner = self.player.learner
         if self._elsewhere is not None:
             self._elsewhere.take(scene)
-        seed = (scene.seed + self._shift) % MOST_SEED
-        events = scene.events if self.meddled else untouched(scene)
-        scene = Scene(seed, scene.count, events)
-        same = 0 if self.scene is None else first_difference(self.scene, scene)
-        del self.moments[same:]
-        self.scene = scene
-        if not self.moments:
-            self._learner = self.player.learner
+            self._elsewhere.play_as(self)
+
+    def play_as(self, other: "Lane") -> None:
+        """Play with the parameters of another lane, from the beginning if they are others than until now."""
+        if self.learner is not other.learner:
+            self.moments.clear()
+            self.learner = other.learner
 
     def through(self, t: int) -> Moment:
         """Return step t, or the last one of an episode that is over before."""
@@ -91,11 +97,11 @@ class Lane:
         meddling, rules = None, standing(scene, t)
         if self.meddled and any(event.kind in _MEDDLING for event in scene.events if event.at <= t):
             meddling = self._meddling(rules, t, places)
-        decided = room.decide(self._learner, params, stood, scene.seed, t, meddling)
+        decided = room.decide(self.learner, params, stood, scene.seed, t, meddling)
         seen = jax.device_get(decided._replace(memory=()))
         if t == 0:
-            self._size = float(np.ptp(seen.scene.agents.positions, axis=0).max(initial=0.0)) / 20
-        shown = picture(seen, now, meddling, player.nearest, self._size)
+            self.size = float(np.ptp(seen.scene.agents.positions, axis=0).max(initial=0.0)) / 20
+        shown = picture(seen, now, meddling, player.nearest, self.size)
         shown |= {"earned": round(earned, 4), "measured": measured, "over": over, "count": now}
         return Moment(room, places, now, stood.state, decided, seen.messages, earned, measured, over, shown)
 
@@ -185,6 +191,8 @@ class Show:
         """Show this scene from now on."""
         self.main.take(scene)
         self.twin.take(scene)
+        if not self._rivals:
+            self.twin.play_as(self.main)  # untouched, and otherwise the same
         self.scene = scene
 
     def frame(self, t: int) -> dict[str, Any]:
@@ -200,6 +208,7 @@ class Show:
         if not self._rivals and begins is not None:  # until then nothing was meddled with
             known = len(self.twin.moments)
             self.twin.moments += self.main.moments[known:begins]
+            self.twin.size = self.main.size
         return {"t": t, "main": main.shown, "twin": self.twin.through(t).shown}
 
 
