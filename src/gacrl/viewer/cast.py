@@ -92,7 +92,9 @@ class Player:
         return self.home, *(size for size in _LADDER if size < most), most
 
     def room(self, places: int) -> Room:
-        """Return the room of that size."""
+        """Return the room of that size; nobody waits for one that is there while another is made."""
+        if (found := self._rooms.get(places)) is not None:
+            return found
         with self._making:
             if places not in self._rooms:
                 self._rooms[places] = self._furnished(places)

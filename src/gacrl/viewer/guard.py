@@ -4,6 +4,7 @@ A page of another site could otherwise make a browser connect to a server on thi
 leads here (DNS rebinding) would make the two look like one site. Imports neither jax nor a web framework.
 """
 
+import functools
 import hmac
 import ipaddress
 import re
@@ -50,8 +51,14 @@ class Guard(NamedTuple):
         try:
             ipaddress.ip_address(name)
         except ValueError:
-            return name in (socket.gethostname().lower(), socket.getfqdn().lower())
+            return name in _own_names()
         return True
+
+
+@functools.cache
+def _own_names() -> tuple[str, str]:
+    """Names of this machine: asked for once, since the second may take a nameserver seconds."""
+    return socket.gethostname().lower(), socket.getfqdn().lower()
 
 
 def same_site(headers: Mapping[str, str]) -> str:

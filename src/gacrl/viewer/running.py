@@ -113,9 +113,12 @@ def warm_up(cast: Cast) -> None:
 def warm_up_the_rest(cast: Cast, shown: threading.Event) -> None:
     """Compile the rooms for other numbers of agents, smallest first, once a first picture is shown."""
     shown.wait(_FIRST_PICTURE)
-    for size in cast.players[0].sizes[1:]:
-        for player in cast.players:
+    least, most = cast.bounds.least, cast.bounds.most
+    for player in cast.players if least < most else ():
+        for size in player.sizes[1:]:
             player.room(size).warm(player.learner, player.params(size, size))
+            if size >= most:
+                break
 
 
 def beside(work: Callable[[], None]) -> threading.Thread:
