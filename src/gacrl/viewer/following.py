@@ -25,13 +25,13 @@ def follow(cast: Cast, board: Board) -> None:
     player = next((player for player in cast.players if player.opened is not None), None)
     if player is None or player.opened is None:
         return
-    folder, seen = play.folder_of(player.name), -1.0
+    folder, seen = play.folder_of(player.name), None
     while True:
-        written = _written(folder.metrics_file)
-        if written != seen:
+        ended = folder.summary_file.exists() or not folder.metrics_file.exists()  # nothing is written after this
+        written = [_written(path) for path in (folder.metrics_file, folder.checkpoints)]
+        if written != seen and _look(player, player.opened, folder, cast.task, board):
             seen = written
-            _look(player, player.opened, folder, cast.task, board)
-        if folder.summary_file.exists() or not folder.metrics_file.exists():
+        if ended:
             return
         time.sleep(EVERY)
 
@@ -43,17 +43,18 @@ def _written(path: Path) -> float:
         return -1.0
 
 
-def _look(player: Player, opened: TrainedRun, folder: RunFolder, task: Task, board: Board) -> None:
-    """Take what is new. A folder in which a training writes may be half way between two states."""
+def _look(player: Player, opened: TrainedRun, folder: RunFolder, task: Task, board: Board) -> bool:
+    """Take what is new, if it is whole. A folder in which a training writes may be half way between two states."""
     try:
         newer = play.newer(opened)
         if newer is not None:
             player.opened, player.learner, player.env_steps = newer, acting(newer), newer.env_steps
         curves = learning(folder.metrics(), task)
+        if curves is not None:
+            board.put("learning", **curves, playing=player.env_steps)
     except Exception:  # what is read is being written: the next look finds it whole
-        return
-    if curves is not None:
-        board.put("learning", **curves, playing=player.env_steps)
+        return False
+    return True
 
 
 def learning(rows: list[dict[str, Any]], task: Task) -> dict[str, Any] | None:
