@@ -263,6 +263,15 @@ def _report(
         f"{task.headline} of {config.evaluation.num_episodes} greedy episodes: interquartile mean, 95 % interval.",
         "curves",
     )
+    _exploration(page, task, ended)
+    page.heading("How this was made")
+    page.code(_command(config, outcomes))
+    page.text(f"Code of commit {', '.join(commits(made))}.")
+    return page.write(out, "report")
+
+
+def _exploration(page: Page, task: Task, ended: Sequence[Outcome]) -> None:
+    """How much was explored, along training and against what greedy play reached."""
     exploring = [o for o in ended if o.name == FULL or "exploration" in o.name]
     page.heading("Exploration")
     page.text(
@@ -285,18 +294,14 @@ def _report(
         f"The level of exploration against {task.headline}: mean over seeds at each evaluation, ordered by the latter.",
         "level-against-headline",
     )
-    page.heading("How this was made")
-    page.code(_command(config, outcomes))
-    page.text(f"Code of commit {', '.join(commits(made))}.")
-    return page.write(out, "report")
 
 
 def _results(page: Page, task: Task, config: RunConfig, outcomes: Sequence[Outcome]) -> None:
     """What each of the runs reached."""
     shown = task.shown(list(outcomes[0].final))
     rows: list[list[str]] = []
+    known = parts_of(config)
     for outcome in outcomes:
-        known = parts_of(config)
         says = known[outcome.name].says if outcome.name in known else "nothing taken away"
         if outcome.diverged is not None:
             cells = [f"diverged: {outcome.diverged}", *[""] * (len(shown) - 1)]
