@@ -71,7 +71,7 @@ def kept_summary(run: Path, command: str) -> dict[str, Any]:
         raise UserError(f"{run} is no finished run ({type(error).__name__}): train it to its end first") from error
     config = files.load(run / "config.json")
     ended = summary["versions"].get(COMMIT)
-    begun = origin["versions"].get(COMMIT) if "versions" in origin else ended  # earlier versions did not note it
+    begun = origin.get("versions", {}).get(COMMIT)
     if begun is None or ended is None:
         raise UserError(f"{run} knows no commit: train it from a checkout of the repository")
     if begun != ended:
@@ -94,7 +94,7 @@ def kept_study(study: Path, command: str) -> dict[str, Any]:
         raise UserError(f"{study} knows no commit: make it from a checkout of the repository")
     if not np.isfinite(list(_numbers(summary))).all():
         raise UserError(f"{study} holds a value that is not a finite number: make it again")
-    return {"command": command, **summary, "versions": made}
+    return {"command": command, **summary}
 
 
 def kept_evaluation(printed: str, command: str) -> dict[str, Any]:
