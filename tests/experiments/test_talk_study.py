@@ -89,7 +89,10 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
                 for seed in config.seeds
             ]
         )
-        summary = {"final": {"greedy": {name: {"values": values.tolist()} for name, values in seeds.items()}}}
+        summary = {
+            "seeds": list(config.seeds),
+            "final": {"greedy": {name: {"values": values.tolist()} for name, values in seeds.items()}},
+        }
         folder.write_summary(summary)
         return session.Ended(out, config, STEPS[-1], summary)
 
@@ -175,7 +178,8 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
     assert done.returns["told"].tolist() == held["returns"]["told"] and len(done.returns["talking"]) == 3
     assert done.further["success 0.1"]["silent"].tolist() == held["further"]["success 0.1"]["silent"]
     assert done.answer.worth.point == pytest.approx(held["worth"][0])
-    assert "10 seeds from 0" in done.report.read_text(encoding="utf-8")
+    written = done.report.read_text(encoding="utf-8")
+    assert "10 seeds from 0, 320 episodes" in written and f"--known {KNOWN}" in written
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ then played with its messages silenced, scrambled and delayed: only that shows w
 """
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -93,8 +94,8 @@ class Talk:
     """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
     made_by: Sequence[Versions] = ()
     """The versions that trained the learners."""
-    known: str = ""
-    """Where the silent and the told learner are from, if they were trained before."""
+    known: Known | None = None
+    """The silent and the told learner, if they were trained before."""
 
     @property
     def measured(self) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -150,7 +151,7 @@ class Talk:
             "worth": list(answer.worth[:3]),
             "used": list(answer.used),
             "random": answer.random,
-            "known": self.known,
+            "known": "" if self.known is None else self.known.says,
             "needs_talk": answer.needs,
             "uses_talk": answer.uses,
             "sentence": self.sentence,
@@ -233,8 +234,8 @@ def _read(out: Path, runs: Sequence[Planned], known: Known | None) -> Talk:
     random = float(unscripted[HEADLINE].mean())
     parameters = {run.name: num_parameters(run.config) for run in runs} | dict(known.parameters if known else {})
     judged = answer(returns, played, random)
-    made, known_from = made_by(run.folder for run in runs), known.says if known else ""
-    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made, known_from)
+    made = made_by(run.folder for run in runs)
+    return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made, known)
 
 
 def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArray[np.float64]]:
@@ -258,7 +259,7 @@ def _report(done: Talk) -> Page:
         f"{config.num_seeds} seeds from {config.seed}. Return of {config.evaluation.final_episodes} fixed episodes, "
         f"greedy, last parameters; mean over seeds and its 95 % bootstrap interval. Random agents: "
         f"{done.answer.random:.2f}."
-        + (f" Silent and told agents are those of {done.known}." if done.known else ""),
+        + (f" Silent and told agents are those of {done.known.says}." if done.known else ""),
     )
     page.table(
         ("messages", "return per agent", "every seed"),
@@ -291,12 +292,12 @@ def _report(done: Talk) -> Page:
         "A task needs talk where the lower bound of told − silent is above 5 % of what silent agents gain over random "
         "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
     )
-    page.code(_command(config))
+    page.code(_command(config, done.known))
     page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
     return page
 
 
-def _command(config: RunConfig) -> str:
+def _command(config: RunConfig, known: Known | None = None) -> str:
     """Write what repeats the study: the flags, and the settings of the task that are not as usual."""
     usual = configuration.on_task(configuration.preset(config.preset), config.task).env
     words = [
@@ -311,6 +312,7 @@ def _command(config: RunConfig) -> str:
             words.append(f"--env.{flag}" if value else f"--env.no-{flag}")
         elif value != getattr(usual, name):
             words.append(f"--env.{flag} {value}")
+    words += [] if known is None else [f"--known {shlex.quote(str(known.file))}"]
     return " ".join(words)
 
 

@@ -16,7 +16,7 @@ from gacrl.config.run import RunConfig
 from gacrl.evaluation import references
 from gacrl.evaluation.statistics import Estimate, estimate, mean, probability_of_improvement
 from gacrl.experiments import scoring
-from gacrl.experiments.study import Planned, reading, why_diverged
+from gacrl.experiments.study import Planned, read_summary, reading, why_diverged
 from gacrl.experiments.talking.kinds import NONE, SILENT, TOLD, num_parameters
 from gacrl.messages import interventions
 from gacrl.messages.bits import bits_sent
@@ -208,7 +208,7 @@ def _ended(run: Planned, task: Task, case: Case) -> Ended:
         return Ended(run.config, parameters, bits, {}, {}, (), {}, because)
     with reading(run.folder):
         folder = RunFolder.open(run.folder)
-        final = json.loads(folder.summary_file.read_text(encoding="utf-8"))["final"]["greedy"]
+        final = read_summary(folder, run.config)["final"]["greedy"]
         rows, seeds = folder.metrics(), run.config.seeds
         along = {
             metric: np.array([[row["greedy"][metric] for row in rows if row["seed"] == seed] for seed in seeds])

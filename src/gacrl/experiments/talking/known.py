@@ -21,6 +21,7 @@ _IN_A_STUDY = {"silent": kinds.NONE, "told": kinds.TOLD}
 class Known(NamedTuple):
     """Learners of the same task with the same settings and steps, by name: silent and told."""
 
+    file: Path
     says: str
     """Where they are from, by which preset, and of how many seeds."""
     finals: Mapping[str, Mapping[str, NDArray[np.float64]]]
@@ -69,9 +70,10 @@ def _known(file: Path, study: Mapping[str, Any], config: RunConfig) -> Known:
         measured = {HEADLINE: study["returns"], **further}
         finals = {who: {metric: by_who[who] for metric, by_who in measured.items()} for who in _IN_A_STUDY}
         parameters = {who: int(study["parameters"][who]) for who in _IN_A_STUDY}
-    seeds = len(finals["silent"][HEADLINE])
+    seeds, episodes = len(finals["silent"][HEADLINE]), study["config"]["evaluation"]["final_episodes"]
     return Known(
-        says=f"{file}: {study['config']['preset']}, {seeds} seeds from {study['config']['seed']}",
+        file=file,
+        says=f"{file}: {study['config']['preset']}, {seeds} seeds from {study['config']['seed']}, {episodes} episodes",
         finals={who: {m: np.asarray(v, float) for m, v in final.items()} for who, final in finals.items()},
         parameters=parameters,
     )

@@ -1,18 +1,26 @@
 """The page of the study of talk: scores of all tasks and kinds, then a task at a time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.statistics import estimate, mean, sample_efficiency, with_interval
+from gacrl.experiments.provenance import Versions, commits, doubts
 from gacrl.experiments.talking.cells import CAUGHT, REACHED, Ended, Finals, Played
 from gacrl.experiments.talking.kinds import SYMBOLS, kinds
 from gacrl.report import figures
 from gacrl.report.page import Page
 
 
-def page(cases: Mapping[str, Played], config: RunConfig, seeds: int, trials: int, command: str) -> Page:
+def page(
+    cases: Mapping[str, Played],
+    config: RunConfig,
+    seeds: int,
+    trials: int,
+    command: str,
+    versions: Sequence[Versions],
+) -> Page:
     """Make the page of what is there. config: the settings that the learners start from. trials: of each."""
     made = Page("Which tasks need talk, and which talk do they need?")
     made.text(
@@ -26,8 +34,10 @@ def page(cases: Mapping[str, Played], config: RunConfig, seeds: int, trials: int
         if trials > 1
         else "Settings that the preset brings were found for symbols. No other kind of communication was tuned."
     )
+    for sentence in doubts(versions):
+        made.text(sentence)
     made.table(("", *cases), scores(cases), "Scores.")
-    names = _kinds(cases)
+    names = kinds_in(cases)
     if cases:
         grid = np.array([[_point(case, case.learners.get(kind)) for case in cases.values()] for kind in names])
         drawn = figures.heat(grid[None], ("", [""]), ("", names), ("", list(cases)), "score")
@@ -43,15 +53,18 @@ def page(cases: Mapping[str, Played], config: RunConfig, seeds: int, trials: int
         "episode. Bits are those that an agent sends in a step of greedy play; a number counts 32."
     )
     made.code(command)
+    made.text(f"Code of commit {', '.join(commits(versions))}.")
     return made
 
 
 def scores(cases: Mapping[str, Played]) -> list[list[str]]:
     """Write a row for each learner: its name, and its score in each case."""
-    return [[kind, *(_score(case, case.learners.get(kind)) for case in cases.values())] for kind in _kinds(cases)]
+    return [
+        [kind, *(_score(case, case.learners.get(kind)) for case in cases.values())] for kind in kinds_in(cases)
+    ]
 
 
-def _kinds(cases: Mapping[str, Played]) -> list[str]:
+def kinds_in(cases: Mapping[str, Played]) -> list[str]:
     """List the learners that are there, in the order of the study."""
     found = {kind for case in cases.values() for kind in case.learners}
     return [kind for kind in kinds() if kind in found]

@@ -14,6 +14,7 @@ from gacrl.config import files as configuration
 from gacrl.config.checks import require, unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
+from gacrl.experiments.provenance import Versions, made_by
 from gacrl.experiments.study import Planned, Watch, claim_folder, refuse_other_settings, train_missing
 from gacrl.experiments.talking import kinds as talkers
 from gacrl.experiments.talking import report
@@ -42,11 +43,19 @@ class Study:
     report: Path
     command: str
     cases: Mapping[str, Played]
+    made_by: Sequence[Versions]
+    """The versions that trained the learners."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return all of it as plain data."""
         cases = {name: found.to_dict() for name, found in self.cases.items()}
-        return {"out": str(self.out), "report": str(self.report), "command": self.command, "cases": cases}
+        return {
+            "out": str(self.out),
+            "report": str(self.report),
+            "command": self.command,
+            "versions": list(self.made_by),
+            "cases": cases,
+        }
 
 
 def all_cases() -> dict[str, tuple[str, Case]]:
@@ -83,7 +92,7 @@ def study(
     asked = [cell for cell in cells if cell.case in wanted and cell.kind in hearing]
     marker = {"config": configuration.to_dict(replace(config, num_seeds=seeds)), "scale": scale, "trials": trials}
     claim_folder(out, "study.json", marker, "study of talk", lambda held: "another study: choose another --out")
-    attempts = {cell.run.name: tried(cell.run, trials) if trials > 1 else [] for cell in cells}
+    attempts = {cell.run.name: tried(cell.run, trials) if trials > 1 else [] for cell in asked}
     if trials == 1:  # else what a learner's rate is to be is not known yet
         refuse_other_settings([cell.run for cell in cells])
     says = {kind: found.says for kind, found in talkers.kinds().items()}
@@ -99,8 +108,9 @@ def study(
         )
         for name in dict.fromkeys(cell.case for cell in ended)
     }
-    command = _command(config, seeds, scale, trials, found)
-    done = Study(out, report.page(found, config, seeds, trials, command).write(out, "report"), command, found)
+    command, made = _command(config, seeds, scale, trials, found), made_by(cell.run.folder for cell in ended)
+    page = report.page(found, config, seeds, trials, command, made)
+    done = Study(out, page.write(out, "report"), command, found, made)
     (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=1) + "\n", encoding="utf-8")
     return done
 
@@ -150,8 +160,7 @@ def _command(config: RunConfig, seeds: int, scale: float, trials: int, cases: Ma
     words = [f"gacrl talk --preset {config.preset} --seeds {seeds} --seed {config.seed}"]
     words += [f"--scale {scale:g}"] if scale != 1 else []
     words += [f"--trials {trials}"] if trials > 1 else []
-    found = {kind for case in cases.values() for kind in case.learners}
-    some_kinds = [kind for kind in talkers.kinds() if kind in found]
+    some_kinds = report.kinds_in(cases)
     words += [f"--tasks {' '.join(cases)}"] if len(cases) < len(all_cases()) else []
     words += [f"--kinds {' '.join(some_kinds)}"] if len(some_kinds) < len(talkers.kinds()) else []
     return " ".join(words)
