@@ -375,6 +375,23 @@ def test_every_number_of_a_table_is_that_of_a_file(table: Table):
                 assert not numbers_in(cell), f"no file is named for {cell!r} ({row[0]}, {head})"
 
 
+STEPS_OF = {
+    **TALK_ROWS, "gacrl": "gacrl-10-seeds", **{name: f"{who}-5-seeds" for who in BASELINES for name in (who, who.upper())}
+}  # fmt: skip
+"""Files of the rows that print environment steps."""
+
+
+def test_environment_steps_are_those_of_the_file():
+    looked_at = 0
+    for table in (table for table in EVERY if "environment steps" in table.head):
+        for row in (row for row in table.rows if row[0] in STEPS_OF):
+            number, *million = row[table.head.index("environment steps")].replace(",", "").split()
+            steps = float(number) * (1e6 if million == ["M"] else 1)
+            assert data(STEPS_OF[row[0]])["env_steps"] == pytest.approx(steps, rel=0.02), row[0]
+            looked_at += 1
+    assert looked_at == 19
+
+
 def test_no_rule_is_left_over():
     assert set(TABLES) == {(table.page, table.section, table.place) for table in EVERY}
 
