@@ -47,7 +47,7 @@ class Visit:
 
     def until(self, expression: str) -> None:
         """Wait for it. (Playwright's own waiting evaluates text, which the page's policy forbids.)"""
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60  # frames come late where several browsers share two cores
         while not self.page.evaluate(expression):
             assert time.monotonic() < deadline, expression
             time.sleep(0.05)
