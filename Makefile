@@ -10,7 +10,7 @@ train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed
 	"$(BIN)/gacrl" train
 
 test: $(STAMP)
-	"$(BIN)/python" -m pytest -n 2 --dist loadgroup
+	"$(BIN)/python" -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 soak: $(STAMP)  ## what is too slow for every change
 	"$(BIN)/python" -m pytest -m soak

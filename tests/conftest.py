@@ -3,7 +3,10 @@
 import contextlib
 import io
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
+from jax._src.lru_cache import LRUCache
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
@@ -29,36 +32,57 @@ install_import_hook("gacrl", "beartype.beartype")
 
 _MANY_PAGES = 2 * 2**30 // 4096
 """2 GB."""
+_FORTNIGHT = 14 * 24 * 3600
+LONGEST = ("runs", "readme", "heard", "own")
+"""Groups of files that take longest: workers begin with them, so that none is left alone with one at the end."""
 
 
-@contextlib.contextmanager
-def compiled_quickly(factory: pytest.TempPathFactory) -> Generator[dict[str, str]]:
-    """Programs compile with little optimisation, and only once for all the tests of a worker.
+_COMPILED: dict[str, Any] = {
+    "jax_compilation_cache_max_size": -1,  # of a bounded one, processes with other settings break the books
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_disable_most_optimizations": True,
+}
 
-    Gives the environment that lets a subprocess share them. Workers do not: JAX writes an unbounded cache without
-    a lock, and reads what is half written.
-    """
-    settings = {
-        "jax_compilation_cache_dir": str(factory.getbasetemp() / "compiled"),
-        "jax_compilation_cache_max_size": -1,  # of a bounded one, processes with other settings break the books
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_disable_most_optimizations": True,
-    }
-    before = {name: jax.config.values[name] for name in settings}
-    for name, value in settings.items():
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the tests of a file to one worker, where they share what is traced, compiled and trained."""
+
+    def group(item: pytest.Item) -> str:
+        mark = item.get_closest_marker("xdist_group")
+        return mark.args[0] if mark else ""
+
+    items.sort(key=lambda item: LONGEST.index(group(item)) if group(item) in LONGEST else len(LONGEST))
+    for item in items:
+        if not group(item):
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+def _put_at_once(cache: LRUCache, key: str, value: bytes) -> None:
+    """Add a program to the folder. JAX itself writes it bit by bit, and another worker reads what is half written."""
+    unfinished = cache.path / f"{key}.{os.getpid()}-{threading.get_ident()}"
+    unfinished.write_bytes(value)
+    unfinished.replace(cache.path / f"{key}-cache")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have programs compiled with little optimisation, and once: workers share a folder, which later runs find full."""
+    folder = Path(config.cache.mkdir("programs")) if hasattr(config, "cache") else Path(tempfile.mkdtemp())
+    for program in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another worker was quicker
+            if program.stat().st_mtime < time.time() - _FORTNIGHT:
+                program.unlink()
+    _COMPILED["jax_compilation_cache_dir"] = str(folder)
+    for name, value in _COMPILED.items():
         jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield {**os.environ, **{name.upper(): str(value) for name, value in settings.items()}}
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+    LRUCache.put = _put_at_once
 
 
-@pytest.fixture(scope="module")
-def quick_start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """For modules that start whole runs, or whose programs are small."""
-    with compiled_quickly(tmp_path_factory) as environment:
-        yield environment
+@pytest.fixture(scope="session")
+def quick_start() -> dict[str, str]:
+    """The environment in which a subprocess finds the programs of the tests. It adds none: see `_put_at_once`."""
+    settings = {**_COMPILED, "jax_persistent_cache_min_compile_time_secs": 1e9}
+    return {**os.environ, **{name.upper(): str(value) for name, value in settings.items()}}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -177,7 +201,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
         *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
     ]
     said = io.StringIO()
-    with compiled_quickly(tmp_path_factory), pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         with contextlib.redirect_stdout(said):
             assert main(["train", *words, "--out", str(folder), "--json"]) == 0

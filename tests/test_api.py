@@ -28,7 +28,7 @@ from gacrl.networks.arrives import arriving
 from gacrl.networks.graph import heard_adjacency
 from gacrl.types import Decision
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("api")]
+pytestmark = pytest.mark.xdist_group("api")
 
 STEPS, EPISODES = 4, 8
 
@@ -131,7 +131,7 @@ class Trained(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def trained(config: gacrl.RunConfig, quick_start: Any, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+def trained(config: gacrl.RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A run under two watchers, and what was said meanwhile."""
     heard: list[Any] = []
     one = gacrl.Watcher(progress=lambda progress: heard.append(("one", progress.env_steps)))

@@ -24,7 +24,7 @@ SILENT, TOLD = 1.2, 5.6
 """What Beacon brings at best without a word (each of six steps ends at the beacon with one chance in five), and to one
 who knows where it is: one step on the way to each of the two outer places is lost."""
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("examples")]
+pytestmark = pytest.mark.xdist_group("examples")
 
 
 @pytest.fixture

@@ -106,7 +106,7 @@ def test_a_strip_shows_moments_in_rows_and_what_is_beside_below(tmp_path: Path):
         film.write(played * 3 + played[:1], out, beside=reel.Beside(others * 3 + others[:1], ""))
 
 
-def test_the_name_of_what_plays_stands_on_the_film(tmp_path: Path, quick_start):
+def test_the_name_of_what_plays_stands_on_the_film(tmp_path: Path):
     """Read from the file: its title is drawn as the name of the run is, and not as another one."""
     out = tmp_path / "film.gif"
     assert main(["render", "noop", "--episodes", "1", "--horizon", "5", "--out", str(out)]) == 0

@@ -16,8 +16,6 @@ from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
 from gacrl.types import Decision
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 GAMMA = 0.9
 
 

@@ -21,7 +21,7 @@ from gacrl.training import build, checkpoint
 from gacrl.training.devices import one_seed, without_padding
 from gacrl.training.recorder import RunFolder
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 N, V, SEEN = 3, 8, 18
 
@@ -42,7 +42,7 @@ def config() -> RunConfig:
 
 
 @pytest.fixture(scope="module")
-def run(config: RunConfig, quick_start: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return untrained(config, tmp_path_factory.mktemp("play") / "run@1")
 
 

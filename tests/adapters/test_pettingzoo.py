@@ -22,9 +22,6 @@ with warnings.catch_warnings():  # one of its tests imports an environment in a 
     from pettingzoo.test import max_cycles_test, parallel_api_test, parallel_seed_test, render_test
 
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
-
 def aec(**settings: Any) -> Any:
     """Make the turn-based form, which two of PettingZoo's tests want."""
     return parallel_to_aec(gacrl.to_pettingzoo("speaker_listener", **settings))

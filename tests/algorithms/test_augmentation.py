@@ -17,8 +17,6 @@ from gacrl.envs.probes import Probe
 from gacrl.errors import ConfigError
 from gacrl.tasks.spread.environment import Spread
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 TRAINING = TrainingConfig(env_steps=100, num_envs=2, num_steps=4)
 
 

@@ -17,7 +17,6 @@ from gacrl.config.run import TrainingConfig
 from gacrl.training.build import constant
 from gacrl.training.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("quick_start")
 BEST = np.array([[0.2, 0.9], [0.6, 0.0]])
 
 

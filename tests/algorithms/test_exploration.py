@@ -19,8 +19,6 @@ from gacrl.envs.probes import Probe
 from gacrl.errors import ConfigError
 from gacrl.types import Decision, Transition
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 LEVELS: dict[str, Any] = {"epsilon": 1.0, "epsilon_end": 0.1, "temperature": 2.0, "temperature_end": 0.5}
 SETTINGS = LearningConfig(**LEVELS, exploration_steps=200, greedy_share=0.25)
 MEASURE = "coverage_0.2"

@@ -28,8 +28,6 @@ from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
 from gacrl.types import Arrives
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 ENV = Spread(num_agents=4, num_landmarks=3)
 TALKING = NetworkConfig(
     torso="graph", width=8, latent="vae", latent_size=3, communication="discrete", vocabulary=4

@@ -19,8 +19,6 @@ from gacrl.config.algorithms import GacrlPaperConfig
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives, Decision, Transition
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 AGENTS, LATENT, SYMBOLS, ACTIONS, OBSERVED, REPLAYED = 3, 16, 8, 5, 18, 4
 
 SHAPES = {  # (2), (5), (6), (8), (9), (11), (12); W6 and W8 need a layer that the text does not name

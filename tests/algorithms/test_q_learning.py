@@ -23,8 +23,6 @@ from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Decision, Observation, Rollout, Transition
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 N, A = 3, 5
 ENV = Spread(N, 1)
 REAL = np.array([True, True, False])

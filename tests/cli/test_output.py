@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import TinyRun
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 GACRL = [sys.executable, "-m", "gacrl"]
 TINY = [

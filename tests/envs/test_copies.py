@@ -16,8 +16,6 @@ from gacrl.evaluation.evaluate import evaluate
 from gacrl.evaluation.references import random
 from gacrl.tasks.spread.environment import Spread
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 E = 6
 KEY = jax.random.key(0)
 MASKS = {"agent_mask": jnp.array([True, True, True, False]), "landmark_mask": jnp.array([True, False, True])}

@@ -13,8 +13,6 @@ from gacrl.algorithms.actions import choices
 from gacrl.envs.environment import Environment, TimeStep, observe, side_by_side, with_self
 from gacrl.types import Decision, Entities, Observation
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 FEATURES = jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
 
 

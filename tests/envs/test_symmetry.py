@@ -8,8 +8,6 @@ import pytest
 from gacrl.envs.symmetry import NUM_SYMMETRIES, turn_action, turn_vectors
 from gacrl.tasks.spread.environment import Spread, SpreadState
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 
 def turned(state: SpreadState, symmetry: int) -> SpreadState:
     return state._replace(

@@ -25,8 +25,6 @@ from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.watching import Watcher
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 PARTS = parts_of(presets.preset("gacrl-112k"))
 """Of every task, and of spread."""
 SCORE = HEADLINE

@@ -18,7 +18,7 @@ from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.watching import Watcher
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 
 def tiny(folder: Path, seed: int) -> Planned:

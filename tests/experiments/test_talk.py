@@ -13,7 +13,7 @@ from gacrl.experiments import talk
 from gacrl.experiments.talk import LEARNERS, SCRAMBLED, SENT, SILENT, TALKING, TOLD
 from gacrl.training.recorder import RunFolder
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 ON_REFERENCE = configuration.on_task(configuration.preset(), "reference")
 

@@ -20,8 +20,6 @@ from gacrl.training.divergence import Diverged
 from gacrl.training.recorder import RunFolder
 from gacrl.training.watching import Watcher
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 PRESET = configuration.preset("gacrl-talk")
 CASE = tasks.find("reference").cases["reference"]
 STEPS = (100, 200, 300, 400)

@@ -28,7 +28,7 @@ from gacrl.training import build
 
 ROOT = Path(__file__).parents[2]
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 
 class Written(NamedTuple):

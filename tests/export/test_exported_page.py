@@ -141,7 +141,7 @@ def in_node(folder: Path, script: str, data: dict[str, Any]) -> dict[str, Any]:
     ],
     ids=["gacrl", "teams", "reference", "colours", "speaker_listener", "unnamed"],
 )
-def test_physics_and_policy_are_those_of_jax(tmp_path: Path, quick_start: Any, run: Callable[[], play.TrainedRun]):
+def test_physics_and_policy_are_those_of_jax(tmp_path: Path, run: Callable[[], play.TrainedRun]):
     found = in_node(tmp_path, "parity.js", recorded(live(run())))
     assert found["steps"] == STEPS
     assert max(found["worst"].values()) < TOLERANCE, found
@@ -173,7 +173,7 @@ def episode(it: Live, intervention: Intervention | None) -> dict[str, Any]:
 
 
 @needs_node
-def test_what_happens_to_words_is_what_happens_to_them_in_jax(tmp_path: Path, quick_start: Any):
+def test_what_happens_to_words_is_what_happens_to_them_in_jax(tmp_path: Path):
     """Silence, swapped and late words, and a voice of one's own, over whole episodes; and their links lead back."""
     it = live(shipped("gacrl-reference"))
     spoken = jnp.zeros((2, 2, 16)).at[:, 0].set(jax.nn.one_hot(jnp.array([2, 8]), 16))
@@ -252,7 +252,7 @@ def test_the_dictionary_counts_what_words_go_with():
     assert unheard == {"agent": 1, "round": 0, "symbol": 2, "of": "heard", "share": 1.0}
 
 
-def test_a_task_that_the_page_cannot_step_is_replayed(tmp_path: Path, quick_start: Any):
+def test_a_task_that_the_page_cannot_step_is_replayed(tmp_path: Path):
     """Moving landmarks are not the page's: the same controls show recorded episodes, and silenced ones beside them."""
     moving = Source("pretrained:gacrl", lambda trained: configuration.changed(trained, {"landmark_speed": 0.2}))
     (out,) = export.writer("html")(moving, tmp_path / "page.html")

@@ -25,8 +25,6 @@ from gacrl.networks.graph import heard_adjacency
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives, Decision, Intervention, Transition
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 N, V = 3, 4
 KEY = jax.random.key(0)
 

@@ -15,8 +15,6 @@ from gacrl.networks.agent import AgentMemory, AgentNetwork, matched, unroll
 from gacrl.networks.layers import num_parameters
 from gacrl.tasks.spread.environment import Spread
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 ENV, T = Probe(), 6
 FIRST = jnp.array([False, False, True, False, True, False])
 

@@ -28,8 +28,6 @@ from gacrl.networks.graph import proximity_adjacency
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 KINDS = ("commnet", "dial", "discrete", "soft", "told", "tarmac", "ic3net")
 EVERYONE = jnp.ones((3, 3), bool) & ~jnp.eye(3, dtype=bool)
 

@@ -17,8 +17,6 @@ from gacrl.networks.layers import num_parameters
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 ENV, EVERYONE = Spread(3, 2), ~jnp.eye(3, dtype=bool)
 SEEN = ENV.reset(jax.random.key(0))[1]._replace(adjacency=EVERYONE)
 act = eqx.filter_jit(lambda network, seen, key=None: network(seen, (), key)[0])

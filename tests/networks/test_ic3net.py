@@ -6,15 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from conftest import drawn
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.networks import communication
 from gacrl.networks.communication import Neighbourhood
 from gacrl.tasks.spread.environment import Spread
-
-pytestmark = pytest.mark.usefixtures("quick_start")
 
 EVERYONE = ~jnp.eye(3, dtype=bool)
 NEAR = Neighbourhood(EVERYONE, jnp.zeros((3, 3, 0)))

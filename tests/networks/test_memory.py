@@ -17,8 +17,6 @@ from gacrl.networks.gru import Gru
 from gacrl.networks.memory import beginnings, restarted
 from gacrl.types import Observation
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 
 class Kept(NamedTuple):
     """Of three agents: two numbers each, one number each, and one of the whole team."""

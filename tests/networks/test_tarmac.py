@@ -4,15 +4,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from conftest import drawn
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.networks import communication
 from gacrl.networks.communication import Neighbourhood
 from gacrl.tasks.spread.environment import Spread
-
-pytestmark = pytest.mark.usefixtures("quick_start")
 
 
 def near(graph: jax.Array) -> Neighbourhood:

@@ -18,8 +18,6 @@ from gacrl.networks.agent import AgentNetwork
 from gacrl.tasks.spread.environment import Spread, SpreadState
 from gacrl.types import Entities, Observation
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 KINDS = ("commnet", "discrete", "tarmac", "ic3net")
 """Soft symbols are the discrete ones where nothing is drawn; they differ in their gradients."""
 

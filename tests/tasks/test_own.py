@@ -20,7 +20,7 @@ from gacrl.scene import compose, discs
 from gacrl.tasks import own
 from gacrl.tasks.task import Metric, Task
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("own")]
+pytestmark = pytest.mark.xdist_group("own")
 
 BEACON = Path(__file__).parents[2] / "examples" / "own_task.py"
 TINY = [
@@ -266,7 +266,7 @@ def said_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, quick_start: dict[str, str]) -> tuple[Path, Path]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A run of Beacon of two seeds, and the file that its task is in."""
     folder = tmp_path_factory.mktemp("own")
     source = write(folder, GOOD)

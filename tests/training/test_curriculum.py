@@ -21,9 +21,6 @@ from gacrl.training import build, checkpoint, curriculum
 from gacrl.training.recorder import RunFolder
 from gacrl.types import Rollout
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
-
 TASK = tasks.find("spread")
 
 

@@ -29,7 +29,6 @@ from gacrl.training import build, checkpoint, devices
 from gacrl.training.distributed import find_place
 from gacrl.training.peers import Place
 
-pytestmark = pytest.mark.usefixtures("quick_start")
 WORKER = Path(spread_worker.__file__)
 
 

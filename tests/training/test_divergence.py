@@ -22,8 +22,6 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import Trainer
 from gacrl.types import Decision
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 
 class Weights(NamedTuple):
     network: Any

@@ -10,8 +10,6 @@ import pytest
 from gacrl.config import presets
 from gacrl.training import build, footprint
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 
 @pytest.mark.parametrize(
     "words",

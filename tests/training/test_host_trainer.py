@@ -22,8 +22,6 @@ from gacrl.training import build
 from gacrl.training.host_trainer import HostTrainer
 from gacrl.training.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 
 @dataclass(frozen=True)
 class Walk(gacrl.Environment):

@@ -20,8 +20,6 @@ from gacrl.tasks.navigation.settings import ColoursSettings
 from gacrl.tasks.spread.environment import Spread
 from gacrl.training import build, session
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 TINY: dict[str, Any] = {
     "algorithm": {"network": {"width": 8}},
     "env": {"max_cycles": 5},

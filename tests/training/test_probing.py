@@ -97,7 +97,6 @@ TWINS = ("ippo", "vdn")
 """Commnet without its channel, and DIAL: what they learn is soaked, and seen by the doctor."""
 
 
-@pytest.mark.usefixtures("quick_start")
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.soak) if name in TWINS else name for name in BASELINES]
 )

@@ -23,7 +23,7 @@ from gacrl.training.trackers.following import tracked
 from gacrl.training.trackers.sink import Sink
 from gacrl.training.trainer import TrainState
 
-pytestmark = [pytest.mark.usefixtures("quick_start", "unchecked"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("unchecked"), pytest.mark.xdist_group("runs")]
 
 PLAN = Plan(1, 1, 1, (), 3, 15, ())
 STATE = TrainState(*[()] * len(TrainState._fields))  # pyright: ignore[reportArgumentType] no tracker looks at it

@@ -30,7 +30,7 @@ from gacrl.training.loop import train
 from gacrl.training.trainer import ChunkReport, Trainer
 from gacrl.types import Decision, Metrics, Policy, Transition
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 PAPER = preset("paper")
 SMALL = replace(
@@ -45,7 +45,7 @@ SMALL = replace(
 
 
 @pytest.fixture(scope="module")
-def trainers(quick_start: dict[str, str]) -> dict[int, Trainer]:
+def trainers() -> dict[int, Trainer]:
     """The paper's algorithm for one and for two seeds, on the two devices that there are."""
     assert jax.local_device_count() == 2
     return {count: build.make_trainer(replace(SMALL, num_seeds=count)) for count in (1, 2)}
@@ -133,7 +133,7 @@ def test_two_members_are_their_seeds_alone(trainers: dict[int, Trainer]):
     assert_members_are_seeds(trainers[1], trainers[2], (3, 4))
 
 
-def test_three_members_are_their_seeds_alone(quick_start: dict[str, str]):
+def test_three_members_are_their_seeds_alone():
     """Each device maps over two seeds; of the last one there are two copies, one of which is never looked at."""
     env = Probe("both")
     single, several = (Trainer(remembering(env), env, constant(), E, T, num_seeds=count) for count in (1, 3))
@@ -202,7 +202,7 @@ class History(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def history(quick_start: dict[str, str]) -> History:
+def history() -> History:
     """Seed 1."""
     trainer = Trainer(remembering(CLOSE), CLOSE, constant(), E, T, metrics=METRICS)
     state, transitions, reports = trainer.init((1,)), [], []

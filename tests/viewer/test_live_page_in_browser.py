@@ -10,13 +10,13 @@ from serving import Site, cast_of, serving
 
 
 @pytest.fixture(scope="module")
-def reference(quick_start: None) -> Iterator[Site]:
+def reference() -> Iterator[Site]:
     with serving(cast_of("pretrained:gacrl-reference")) as site:
         yield site
 
 
 @pytest.fixture(scope="module")
-def teams(quick_start: None) -> Iterator[Site]:
+def teams() -> Iterator[Site]:
     with serving(cast_of("pretrained:gacrl-teams")) as site:
         yield site
 

@@ -28,7 +28,7 @@ SILENCE = {"at": 0, "kind": "fate", "agent": 0, "fate": {"kind": "silence"}}
 
 
 @pytest.fixture(scope="module")
-def reference(quick_start: None) -> Iterator[Site]:
+def reference() -> Iterator[Site]:
     with serving(cast_of("pretrained:gacrl-reference")) as site:
         yield site
 
@@ -213,7 +213,7 @@ def test_what_is_put_up_reaches_who_comes_later(reference: Site):
 
 
 @pytest.mark.soak
-def test_a_training_has_a_page_of_its_own_process(quick_start: None):
+def test_a_training_has_a_page_of_its_own_process():
     """It opens once there is a checkpoint, answers as any page, and ends with the training."""
     said: list[str] = []
     folder, opened = play.folder_of("pretrained:gacrl-reference"), play.open_one("pretrained:gacrl-reference")

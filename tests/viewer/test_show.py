@@ -34,9 +34,7 @@ def fated(fates: dict[int, Fate]) -> tuple[Event, ...]:
     return tuple(Event(0, "fate", agent=agent, fate=fate) for agent, fate in fates.items())
 
 
-def test_the_untouched_lane_plays_with_the_parameters_of_the_other(
-    quick_start: None, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_untouched_lane_plays_with_the_parameters_of_the_other(monkeypatch: pytest.MonkeyPatch):
     """A run that is being trained has newer ones from each new start on, and not from a silence on."""
     cast = cast_of("pretrained:gacrl-reference")
     show, player, kept = Show(cast), cast.players[0], cast.players[0].learner
@@ -51,7 +49,7 @@ def test_the_untouched_lane_plays_with_the_parameters_of_the_other(
 
 
 @pytest.mark.parametrize("case", soaked(CASES, "swap", "delay"))
-def test_what_happens_to_words_happens_as_in_evaluation(quick_start: None, case: str):
+def test_what_happens_to_words_happens_as_in_evaluation(case: str):
     cast = cast_of("pretrained:gacrl-reference")
     happens, fates = CASES[case]
     show, player = Show(cast), cast.players[0]
@@ -81,7 +79,7 @@ def test_what_happens_to_words_happens_as_in_evaluation(quick_start: None, case:
     assert (frames[3]["twin"] is None) == (case == "nothing")
 
 
-def test_a_moment_comes_back_and_only_what_changed_is_played_again(quick_start: None):
+def test_a_moment_comes_back_and_only_what_changed_is_played_again():
     show = Show(cast_of("pretrained:gacrl-reference"))
     show.take(Scene(3, 2))
     first = [show.frame(t)["main"] for t in range(26)]
@@ -99,7 +97,7 @@ def test_a_moment_comes_back_and_only_what_changed_is_played_again(quick_start: 
     assert show.frame(25)["twin"] == first[25]
 
 
-def test_agents_come_and_go_and_a_radius_silences(quick_start: None):
+def test_agents_come_and_go_and_a_radius_silences():
     """A team that grows in the middle of an episode goes on from where it stood, and plays as one that began so large."""
     cast = cast_of("pretrained:gacrl-teams")
     player, show = cast.players[0], Show(cast)
@@ -146,7 +144,7 @@ class Walk(Environment):
         return observe(state[0], num_actions=2, positions=state[0])
 
 
-def test_a_task_of_ones_own_can_be_watched_and_moved(quick_start: None, from_outside: None):
+def test_a_task_of_ones_own_can_be_watched_and_moved(from_outside: None):
     """Episodes that end early are over there; what a hand moves is where it was put, and goes on from there."""
 
     def edit(state, hand):
@@ -163,7 +161,7 @@ def test_a_task_of_ones_own_can_be_watched_and_moved(quick_start: None, from_out
     assert 5.0 <= frames[3]["agents"]["x"][1] <= 5.1 and frames[0]["agents"]["radius"][0] > 0
 
 
-def test_any_task_can_be_watched(quick_start: None):
+def test_any_task_can_be_watched():
     """Cars that come and go, with the actions of a script; and two policies beside each other."""
     cars = open_cast(["yielder"], task="traffic_junction")
     show = Show(cars)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.xdist_group("runs")
 
 
 @pytest.fixture(scope="module")
-def report(tiny_run: TinyRun, tmp_path_factory: pytest.TempPathFactory, quick_start: Any) -> Path:
+def report(tiny_run: TinyRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report") / "all of it.html"
     assert main(["compare", str(tiny_run.folder), "--label", "</script><b>one", "--out", str(out)]) == 0
     return out

@@ -12,7 +12,7 @@ from gacrl.experiments.paper import grid as sweep
 from gacrl.experiments.paper.grid import Grid, Member, Point, expected_range, noise_of, paper_grid
 from gacrl.training import build
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from gacrl.networks.agent import acting_parameters, matched
 from gacrl.tasks.spread.settings import METRICS, SpreadSettings
 from gacrl.training.recorder import RunFolder
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = pytest.mark.xdist_group("runs")
 
 SEEDS, STRETCHES = 5, 30
 FOUR = ("GACRL", "QMIX", "MAPPO", "IPPO")

@@ -19,8 +19,6 @@ from gacrl.tasks.navigation.environment import make
 from gacrl.tasks.navigation.uttered import uttered
 from gacrl.types import Decision, Memory, Observation, Policy, PRNGKey
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 KEY = jax.random.key(3)
 NETWORK = NetworkConfig(torso="graph", width=16, communication="discrete", vocabulary=10, second_look=True)
 

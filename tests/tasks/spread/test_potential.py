@@ -13,8 +13,6 @@ from gacrl.tasks.spread.potential import assignment_potential
 from gacrl.tasks.spread.settings import SpreadSettings
 from gacrl.training import build
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 AGENTS = jnp.array([[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]])
 LANDMARKS = jnp.array([[-1.0, 0.0], [0.25, 0.0]])
 

@@ -21,8 +21,6 @@ from gacrl.tasks.traffic.settings import LEVELS, TrafficSettings
 from gacrl.tasks.traffic.task import TASK
 from gacrl.training.curriculum import _moves
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 KEY = jax.random.key(0)
 GAS, BRAKE = 0, 1
 NO_ONE, EVERYONE = TrafficParams(0.0), TrafficParams(1.0)
