@@ -6,7 +6,9 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from dataclasses import replace
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,6 +95,43 @@ def forget_programs() -> Iterator[None]:
     pages = int(in_use.read_text().split()[1]) if in_use.exists() else _MANY_PAGES
     if pages >= _MANY_PAGES:
         jax.clear_caches()
+
+
+@cache
+def _trainers() -> Callable[..., Any]:
+    from gacrl.training import build
+
+    return lru_cache(maxsize=16)(build.make_trainer)
+
+
+@contextlib.contextmanager
+def kept_trainers() -> Generator[None]:
+    """Runs of the same settings have the same trainer, whatever their seeds: what it has traced is not traced again."""
+    from gacrl import tasks
+    from gacrl.config.algorithms import GacrlPaperConfig
+    from gacrl.training import build, session
+
+    make: Any = _trainers()
+
+    def kept(config: Any, *given: Any, **named: Any) -> Any:
+        if tasks.brought(config.task) is not None:  # whose name may be another's in the next test
+            return make.__wrapped__(config, *given, **named)
+        config = replace(config, seed=0)
+        if isinstance(config.algorithm, GacrlPaperConfig):  # whose functions do not know how long a run is
+            config = replace(config, training=replace(config.training, env_steps=450))
+        return make(config, *given, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "make_trainer", kept)
+        patch.setattr(session, "make_trainer", kept)
+        yield
+
+
+@pytest.fixture(scope="module")
+def one_trainer() -> Iterator[None]:
+    """For modules whose runs are started, resumed and played again."""
+    with kept_trainers():
+        yield
 
 
 @pytest.fixture
@@ -201,7 +240,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
         *("--env.max-cycles", "15", "--algorithm.replay-capacity", "500"),
     ]
     said = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
+    with kept_trainers(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_tables, "_play_scripted", lambda *task: SCRIPTED_ROW)
         with contextlib.redirect_stdout(said):
             assert main(["train", *words, "--out", str(folder), "--json"]) == 0

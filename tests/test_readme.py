@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from conftest import SCRIPTED_ROW
+from conftest import SCRIPTED_ROW, kept_trainers
 
 import gacrl
 from gacrl.cli import main as cli
@@ -59,7 +59,7 @@ def room(from_outside, room_of_short_schedules):
 
 
 @pytest.fixture(scope="module")
-def room_of_short_schedules(tmp_path_factory, quick_start):
+def room_of_short_schedules(tmp_path_factory):
     """A folder to work in, in which the paper's schedule is short."""
 
     def short(preset: RunConfig) -> RunConfig:
@@ -107,6 +107,11 @@ def test_every_command_does_what_it_says(room, capsys):
     commands = [shlex.split(command) for command in COMMANDS if command.startswith("gacrl ")]
     assert {words[1] for words in commands} == set(cli._COMMANDS), "every command has its line"
     commands = [words for words in commands if words[1] not in LONG]
+    with kept_trainers():
+        run_each(commands, capsys)
+
+
+def run_each(commands: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
     for words in commands:
         if ">" in words:
             words, target = words[: words.index(">")], words[words.index(">") + 1]

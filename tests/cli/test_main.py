@@ -33,7 +33,7 @@ from gacrl.experiments import scoring
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import checkpoint
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]  # the tiny run's
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]  # the tiny run's
 
 EPISODES = 8
 """Of the tiny run's closing evaluation."""

@@ -2,7 +2,9 @@
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +19,19 @@ from gacrl.messages import interventions
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import session
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]
 
 EVALUATED = ["--episodes", "4", "--horizon", "6"]
 NOTHING = {who: dict.fromkeys(METRICS, reached) for who, reached in (("random", -2.0), ("oracle", -1.0))}
 """What the scripted policies reach."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def parsed_once() -> Iterator[None]:
+    """The same words are the same intervention, so that the command and Python share a program."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interventions, "parse", cache(interventions.parse))
+        yield
 
 
 @pytest.fixture
@@ -122,7 +132,7 @@ def test_what_cannot_be_done_is_one_sentence(
 
 
 @pytest.fixture(scope="module")
-def silent_run(tmp_path_factory: pytest.TempPathFactory, quick_start: dict[str, str]) -> Path:
+def silent_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose agents say nothing."""
     ippo = presets.preset("ippo")
     config = replace(

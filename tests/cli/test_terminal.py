@@ -24,7 +24,7 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.telling import standing
 from gacrl.training.watching import Watcher
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ GACRL_FUZZ says how many inputs each search tries; `make soak` tries more.
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import io
 import json
@@ -35,7 +34,7 @@ from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import build, checkpoint, session
 
 pytestmark = [
-    pytest.mark.usefixtures("quick_start"),
+    pytest.mark.usefixtures("one_trainer"),
     pytest.mark.xdist_group("runs"),
     # Whatever thread draws from `random` while a strategy runs, it is none of ours.
     pytest.mark.filterwarnings("ignore:Do not use the `random` module inside strategies"),
@@ -56,13 +55,12 @@ def searched(count: int) -> Any:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def traced_once() -> Iterator[None]:
-    """What is searched is what reads: trainers are kept, scripted policies and pictures are not made."""
+def nothing_drawn() -> Iterator[None]:
+    """What is searched is what reads: scripted policies and pictures are not made."""
     with pytest.MonkeyPatch.context() as patch:
         references = {
             name: dict.fromkeys(METRICS, float(k)) for k, name in enumerate(("random", "noop", "oracle"))
         }
-        patch.setattr(session, "make_trainer", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: references)
         patch.setattr(scoring, "_references", lambda *_: references)
         patch.setattr(session.episodes, "cut", lambda *_: [])

@@ -17,7 +17,7 @@ from gacrl.training import build, session
 from gacrl.training.session import Ended
 from gacrl.training.watching import Watcher
 
-pytestmark = pytest.mark.usefixtures("quick_start")
+pytestmark = pytest.mark.usefixtures("one_trainer")
 
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 FAMILIES = ("vdn", "mappo")

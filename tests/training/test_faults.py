@@ -1,7 +1,6 @@
 """What a run survives: kills while it writes, full and read-only disks, damage, a clock that jumps back."""
 
 import contextlib
-import functools
 import json
 import os
 import resource
@@ -14,7 +13,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ import pytest
 from conftest import TinyRun, content
 
 from gacrl import play
-from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.experiments.paper import tables as paper_tables
 from gacrl.training import build, checkpoint, session
@@ -32,24 +29,14 @@ from gacrl.training.recorder import RunFolder
 from gacrl.training.watching import Watcher
 from gacrl.training.writer import Writer
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]
 
-BUILD = build.make_trainer
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def traced_once() -> Iterator[None]:
-    """A run that is gone on with has the trainer that it had: nothing is traced again. And nothing is drawn."""
-    kept = functools.cache(BUILD)
-
-    def build(config: RunConfig) -> Any:
-        return kept(
-            replace(config, training=replace(config.training, env_steps=450))
-        )  # of no matter to the paper's
-
+def nothing_drawn() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "make_trainer", build)
         patch.setattr(session.episodes, "cut", lambda *_: [])
         patch.setattr(session.reel, "gif", lambda *_, **__: None)
         patch.setattr(paper_tables, "table_2", lambda *_: [])

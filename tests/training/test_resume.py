@@ -32,7 +32,7 @@ from gacrl.experiments.paper import tables as paper_tables
 from gacrl.training import checkpoint
 from gacrl.training.recorder import RunFolder
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]
 
 STEPS, CHUNK, LAST = 450, 60, 30
 """The tiny run's."""

@@ -1,6 +1,5 @@
 """A run from start to end in one process: whose error it is, and where it is written."""
 
-import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -18,11 +17,11 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError
 from gacrl.experiments import ablate, search, study
 from gacrl.experiments.paper import reproduce
-from gacrl.training import build, session
+from gacrl.training import session
 from gacrl.training.divergence import Diverged
 from gacrl.training.watching import Watcher
 
-pytestmark = pytest.mark.usefixtures("quick_start")
+pytestmark = pytest.mark.usefixtures("one_trainer")
 
 TINY: dict[str, Any] = {
     "algorithm": {"network": {"width": 8}},
@@ -30,14 +29,12 @@ TINY: dict[str, Any] = {
     "training": {"env_steps": 40, "num_envs": 2, "num_steps": 5},
     "evaluation": {"interval": 20, "num_episodes": 2, "final_episodes": 2},
 }
-BUILD = build.make_trainer
 
 
 @pytest.fixture(scope="module", autouse=True)
-def traced_once() -> Iterator[None]:
-    """Every run of this module has the same trainer."""
+def no_references() -> Iterator[None]:
+    """What scripted policies reach does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "make_trainer", functools.cache(BUILD))
         patch.setattr(session, "evaluate_scripted", lambda *_: {"random": {}, "noop": {}, "oracle": {}})
         patch.setattr(session, "normalised", lambda metrics, references, scale: metrics)
         yield

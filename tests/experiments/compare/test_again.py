@@ -13,7 +13,7 @@ from gacrl.config import presets
 from gacrl.config.run import EvaluationConfig, RunConfig, TrainingConfig
 from gacrl.training import session
 
-pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
+pytestmark = [pytest.mark.usefixtures("one_trainer"), pytest.mark.xdist_group("runs")]
 
 
 def tiny(horizon: int, episodes: int) -> RunConfig:
@@ -30,7 +30,7 @@ def tiny(horizon: int, episodes: int) -> RunConfig:
 
 
 @pytest.fixture(scope="module")
-def runs(quick_start: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """One of 4 steps an episode, one of 6."""
     folder = tmp_path_factory.mktemp("again")
     return tuple(  # pyright: ignore[reportReturnType]
