@@ -19,8 +19,6 @@ from gacrl.networks.communication import Neighbourhood
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives
 
-pytestmark = pytest.mark.usefixtures("quick_start")
-
 EVERYONE = ~jnp.eye(3, dtype=bool)
 TASKS: dict[str, Environment] = {
     "a vector": Probe(num_agents=3),
@@ -60,9 +58,13 @@ def test_what_is_told_by_hand():
     np.testing.assert_array_equal(spoken.hidden, hidden)
 
 
-@pytest.mark.parametrize("recurrent", [False, True])
-@pytest.mark.parametrize("torso", ["mlp", "graph"])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    ("task", "torso", "recurrent"),
+    [
+        *((task, torso, False) for task in TASKS for torso in ("mlp", "graph")),
+        *(("a vector", torso, True) for torso in ("mlp", "graph")),
+    ],
+)
 def test_nothing_that_the_speaker_sees_is_lost(task: str, torso: Any, recurrent: bool):
     """Each of its features changes what each hearer puts out, and has a gradient there; those of the unheard none."""
     env = TASKS[task]
