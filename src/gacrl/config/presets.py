@@ -147,9 +147,6 @@ _GACRL_TEAMS = _gacrl(
     network=replace(_GACRL_NETWORK, nearest_landmarks=8, nearest_agents=12),
 )
 
-# The same values, and a critic that is told what others see: words are found in more seeds (docs/log.md).
-_GACRL_TALK = _gacrl("gacrl-talk", SpreadSettings(), env_steps=60_000, critic="told")
-
 # GACRL's switches on the baselines, and its number of parameters: what is left is the algorithm, tuned in six trials
 # (docs/tuning). QMIX, which has VDN's settings, collapses in some seeds with them as with those of its best trial.
 _GRAPH = NetworkConfig(torso="graph", parameters=GACRL_PARAMETERS)
@@ -181,10 +178,6 @@ PRESETS: Mapping[str, tuple[str, RunConfig]] = MappingProxyType(
         "gacrl-teams": (
             "GACRL for teams of any size: trained with 5 agents, each sees what is near",
             _GACRL_TEAMS,
-        ),
-        "gacrl-talk": (
-            "GACRL whose critic is told what others see, for tasks in which something has to be said",
-            _GACRL_TALK,
         ),
         "graph-vdn": (
             "VDN with GACRL's switches: entity graph, symmetry, coverage bonus",

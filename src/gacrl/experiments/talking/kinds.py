@@ -63,7 +63,7 @@ def base(config: RunConfig, case: Case, seeds: int, scale: float) -> Base:
 
 
 def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunConfig:
-    """Return the settings of the learner with symbols. Raises UserError for what cannot talk."""
+    """Return the settings of the learner with symbols, whose critic is told. Raises UserError for what cannot talk."""
     if getattr(config.algorithm, "network", None) is None:
         raise UserError(
             f"--preset {config.preset} has a network of its own: name one whose messages can be chosen"
@@ -76,7 +76,7 @@ def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunC
         "training": {"env_steps": env_steps},
         "evaluation": {"interval": max(interval, 1)},
     }
-    return configuration.from_dict(changes, config)
+    return configuration.with_told_critic(configuration.from_dict(changes, config))
 
 
 def num_parameters(config: RunConfig) -> int:
