@@ -130,7 +130,8 @@ def _gacrl(name: str, env: SpreadSettings, env_steps: int = 112_500, **changes: 
         **_LEARNER,
         "epsilon": 0.3,
         "temperature": 0.1,
-        "temperature_end": 0.05,
+        "temperature_end": 0.02,
+        "gamma": 0.9,
         **changes,
     }
     training = TrainingConfig(env_steps=env_steps, num_envs=25, num_steps=1)

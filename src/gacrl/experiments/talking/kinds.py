@@ -27,6 +27,8 @@ NONE, REMEMBERING, TOLD, SYMBOLS, UTTERED = "none", "none-recurrent", "told", "d
 SILENT = (NONE, REMEMBERING)
 """Who says nothing: the better one is the floor of a score."""
 EVALUATIONS = 16
+CLOSING_EPISODES = 512
+"""Whatever is compared at the end plays as many."""
 _WINDOW = 8
 """Steps of a replayed window where something is carried from step to step, as the preset `dial` has it."""
 
