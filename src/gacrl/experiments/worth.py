@@ -41,7 +41,7 @@ def remarkable(found: Mapping[str, Worth]) -> dict[str, Worth]:
 
 
 def _worth(task: Task, metric: str, whole: Values, without: Values) -> Worth:
-    sign = 1.0 if task.metric(metric).higher_is_better else -1.0
+    sign = task.metric(metric).sign
     probability = probability_of_improvement(sign * whole, sign * without)
     enough = min(len(whole), len(without)) >= CLAIMED_FROM
     said: Said = ""

@@ -32,6 +32,11 @@ class Metric(NamedTuple):
     defined_by: tuple[str, ...] = ()
     """Settings of the task that define it: where they differ it cannot be compared."""
 
+    @property
+    def sign(self) -> float:
+        """What makes more of it better: 1 or −1."""
+        return 1.0 if self.higher_is_better else -1.0
+
 
 class Words(NamedTuple):
     """What a picture calls the things in it."""

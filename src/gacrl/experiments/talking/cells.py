@@ -102,8 +102,8 @@ class Played:
         }
         if not known:
             return None
-        pick = max if self.task.metric(headline).higher_is_better else min
-        who = pick(known, key=lambda name: known[name])
+        sign = self.task.metric(headline).sign
+        who = max(known, key=lambda name: sign * known[name])
         return Best(who, known[who])
 
     def scores(self, values: Values) -> Values | None:
@@ -121,7 +121,7 @@ class Played:
     def better_than_silence(self, kind: str) -> Estimate | None:
         """Return P(a seed does better than one of the better silent learner); None where one of both is missing."""
         headline = self.task.headline
-        sign = 1.0 if self.task.metric(headline).higher_is_better else -1.0
+        sign = self.task.metric(headline).sign
         silent = [sign * self.learners[name].final[headline] for name in SILENT if self._ended(name)]
         if not silent or not self._ended(kind):
             return None

@@ -49,4 +49,4 @@ def _worth(trial: Planned) -> float:
     with reading(trial.folder):
         rows = RunFolder.open(trial.folder).metrics()
         last = [row["greedy"][task.headline] for row in rows if row["env_steps"] == rows[-1]["env_steps"]]
-        return float(np.mean(last)) * (1.0 if task.metric(task.headline).higher_is_better else -1.0)
+        return float(np.mean(last)) * task.metric(task.headline).sign
