@@ -23,7 +23,8 @@ from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.evaluation.metrics import measures_of, table_of
-from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing, why_diverged
+from gacrl.experiments.results import why_diverged
+from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing
 from gacrl.report.page import Page
 from gacrl.training.recorder import RunFolder
 

@@ -1,13 +1,10 @@
 """A folder of planned runs: it says what it is for, and a stopped study goes on with the runs that are missing."""
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
@@ -44,36 +41,6 @@ class Watch:
     finished: Callable[[str, str], None] = lambda name, how: None
     """(name, how it ended)."""
     say: Callable[[str], None] = lambda sentence: None
-
-
-@contextmanager
-def reading(folder: Path) -> Generator[None]:
-    """Raises UserError where what is read from a run of a study turns out to be damaged."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, ValueError, RecursionError, OSError) as error:
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        raise UserError(f"{folder} is damaged ({what}): remove that folder to train the run again") from error
-
-
-def read_summary(folder: RunFolder, planned: RunConfig) -> dict[str, Any]:
-    """Return the summary of a finished run. Raises ValueError where its seeds are not those that were planned."""
-    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
-    seeds = list(planned.seeds)
-    if summary["seeds"] != seeds:
-        raise ValueError(f"it holds seeds {summary['seeds']}, not {seeds}")
-    for metrics in summary["final"].values():
-        for metric, entry in metrics.items():
-            if metric.startswith("score_"):
-                continue
-            if len(entry["values"]) != len(seeds) or not np.isfinite(entry["values"]).all():
-                raise ValueError(f"a seed of {seeds} lacks a value of {metric}")
-    return summary
-
-
-def why_diverged(folder: Path) -> str | None:
-    """Why the run in that folder diverged; None for one that did not."""
-    return RunFolder(folder).why_diverged()
 
 
 def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:

@@ -3,15 +3,10 @@
 from collections.abc import Mapping
 from typing import Literal, NamedTuple, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gacrl.evaluation.statistics import Difference, Estimate, difference, probability_of_improvement
+from gacrl.experiments.results import Finals, Values
 from gacrl.tasks.task import Task
 
-Values: TypeAlias = NDArray[np.float64]
-Finals: TypeAlias = Mapping[str, Values]
-"""Per metric: each seed's value [S]."""
 Said: TypeAlias = Literal["helps", "costs", "may help", "may cost", ""]
 
 CLAIMED_FROM = 10

@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gacrl.config.run import RunConfig
+from gacrl.experiments import results
 from gacrl.experiments.paper import references as scripted
 from gacrl.experiments.paper.references import Difficulty, Episodes, difficulty
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.provenance import Versions, made_by
-from gacrl.experiments.study import read_summary, reading, why_diverged
+from gacrl.experiments.results import reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]
@@ -151,13 +152,12 @@ def read_series(path: Path) -> Series:
 
 
 def _read_series(path: Path) -> Series:
-    folder = RunFolder.open(path)
-    config, rows = folder.config(), folder.metrics()
-    summary = read_summary(folder, config)
-    by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
+    config = RunFolder.open(path).config()
+    found = results.read(path, config)
+    by_seed = found.rows
     ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
     kept = np.flatnonzero(ended.min(0) > 0)
-    names = list(rows[0]["train"]["mean"])
+    names = list(by_seed[0][0]["train"]["mean"])
 
     def stacked(what: str) -> dict[str, np.ndarray]:
         return {
@@ -176,17 +176,12 @@ def _read_series(path: Path) -> Series:
         last=_with_fixed_ratio(stacked("last_episode"), ends),
         tasks=tuple(by_seed[0][k]["task"] for k in kept),
         final={
-            kind: _with_fixed_ratio(_final(summary["final"][kind]), config.env.local_ratio)
-            for kind in ("greedy", "sampled")
+            kind: _with_fixed_ratio(found.final(kind), config.env.local_ratio) for kind in ("greedy", "sampled")
         },
-        scripted=summary["references"],
-        seconds=float(summary["wall_seconds"]),
+        scripted=found.summary["references"],
+        seconds=float(found.summary["wall_seconds"]),
         made_by=made_by([path]),
     )
-
-
-def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {name: np.array(entry["values"]) for name, entry in metrics.items() if not name.startswith("score_")}
 
 
 def _with_fixed_ratio(metrics: Metrics, ratio: float | np.ndarray) -> Metrics:

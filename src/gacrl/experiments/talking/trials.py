@@ -7,7 +7,8 @@ import numpy as np
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.experiments.study import Planned, reading, why_diverged
+from gacrl.experiments.results import reading, why_diverged
+from gacrl.experiments.study import Planned
 from gacrl.training.recorder import RunFolder
 
 FACTORS = (1.0, 1 / 3, 3.0, 1 / 9, 9.0)
