@@ -3,7 +3,6 @@
 Each part is a run folder of its own, so that a stopped ablation goes on with what is missing.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +35,7 @@ from gacrl.experiments.study import (
 )
 from gacrl.experiments.talking.kinds import num_parameters, with_central_critic
 from gacrl.experiments.worth import CLAIMED_FROM, remarkable, worths
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import Task
@@ -137,7 +137,7 @@ def ablate(
     task, outcomes = tasks.find(config.task), tuple(_outcome(run) for run in runs)
     made = made_by(run.folder for run in runs)
     done = Ablation(out, _report(out, config, configured, outcomes, made), task, outcomes, made)
-    (out / "summary.json").write_text(json.dumps(done.results(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.results())
     return done
 
 

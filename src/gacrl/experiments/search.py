@@ -25,6 +25,7 @@ from gacrl.errors import ConfigError, UserError, reason
 from gacrl.evaluation.metrics import measures_of, table_of
 from gacrl.experiments.results import why_diverged
 from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing
+from gacrl.replacing import replace_json
 from gacrl.report.page import Page
 from gacrl.training.recorder import RunFolder
 
@@ -324,7 +325,7 @@ def conclude(spec: Spec, out: Path) -> Search:
         page.code(f"gacrl train --config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}{task}")
     page.write(out, "report")
     done = Search(out, out / "report.html", ranked)
-    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.to_dict())
     return done
 
 

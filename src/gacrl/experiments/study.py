@@ -8,6 +8,7 @@ from typing import Any
 
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
+from gacrl.replacing import replace_json, unfinished
 from gacrl.training import session
 from gacrl.training.devices import release_memory
 from gacrl.training.divergence import Diverged
@@ -79,7 +80,7 @@ def claim_folder(
     kind: what the study is called. other: the sentence about a folder that holds one of its kind with other settings,
     from those. Raises UserError for it, for a folder that holds something else, and for one that cannot be written.
     """
-    path, unfinished = out / marker, out / f".{marker}.unfinished"
+    path = out / marker
     if path.is_file():
         try:
             held: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -90,12 +91,11 @@ def claim_folder(
         if held != json.loads(json.dumps(asked)):  # as it would be read: tuples are lists
             raise UserError(f"{out} holds {other(held)}")  # pyright: ignore[reportUnknownArgumentType]
         return
-    if out.exists() and (not out.is_dir() or any(entry != unfinished for entry in out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(entry != unfinished(path) for entry in out.iterdir())):
         raise UserError(f"{out} exists and holds no {kind}: choose another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(json.dumps(asked, indent=2) + "\n", encoding="utf-8")
-        unfinished.replace(path)
+        replace_json(path, asked)
     except OSError as error:
         raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
 

@@ -4,7 +4,6 @@ Each learner is a run folder of its own, so that a stopped study resumes with wh
 then played with its messages silenced, scrambled and delayed: only that shows whether anybody listens.
 """
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,6 +40,7 @@ from gacrl.experiments.talking.cells import CAUGHT
 from gacrl.experiments.talking.kinds import hears_by, num_parameters, talker
 from gacrl.experiments.talking.known import Known, read
 from gacrl.messages import interventions
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import HEADLINE, MATTERS, Task
@@ -188,7 +188,7 @@ def talk(
     done = _read(out, runs, before)
     page = _report(done)
     done = replace(done, report=page.write(out, "report"))
-    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.to_dict())
     return done
 
 

@@ -16,6 +16,7 @@ from gacrl.config import files as configuration
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
+from gacrl.replacing import replace_json, replace_text
 from gacrl.versions import version, versions
 
 SHOWN_EPISODES = 4
@@ -57,8 +58,8 @@ class RunFolder:
             folder = cls(path)
             folder.checkpoints.mkdir()
             folder.episodes.mkdir()
-            folder._replace(folder.origin_file, json.dumps(_origin(config, begun_from), indent=2) + "\n")
-            folder._replace(folder.config_file, configuration.dumps(config))
+            replace_json(folder.origin_file, _origin(config, begun_from))
+            replace_text(folder.config_file, configuration.dumps(config))
             folder.metrics_file.touch()
         except OSError as error:
             raise UserError(
@@ -200,22 +201,22 @@ class RunFolder:
         """Drop the rows past a checkpoint, which the resumed run writes again; returns how many stay."""
         rows = self.metrics() if self.metrics_file.exists() else []
         rows = [row for row in rows if row["env_steps"] <= env_steps]
-        self._replace(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+        replace_text(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
         return len(rows)
 
     def extend(self, env_steps: int) -> None:
         """Set the planned environment steps anew; every other setting stays as it stands in the file."""
         settings = self.settings()
         settings["training"] = {**settings.get("training", {}), "env_steps": env_steps}
-        self._replace(self.config_file, json.dumps(settings, indent=2) + "\n")
+        replace_json(self.config_file, settings)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Replace `summary.json`."""
-        self._replace(self.summary_file, json.dumps(summary, indent=2) + "\n")
+        replace_json(self.summary_file, summary)
 
     def write_diverged(self, because: str) -> None:
         """Say in `diverged.json` that the run ended so."""
-        self._replace(self.diverged_file, json.dumps({"because": because}) + "\n")
+        replace_json(self.diverged_file, {"because": because}, indent=None)
 
     def why_diverged(self) -> str | None:
         """Why the run diverged; None where it did not. Raises UserError for a damaged file."""
@@ -227,16 +228,6 @@ class RunFolder:
             raise UserError(
                 f"{self.diverged_file} is damaged: remove it, and `gacrl resume {self.path}` finds out again"
             ) from error
-
-    def _replace(self, path: Path, text: str) -> None:
-        """Write a whole file so that a reader sees the old one or the new one, never half of it."""
-        unfinished = path.with_name(f".{path.name}.unfinished")
-        unfinished.unlink(missing_ok=True)  # by a process that was killed; or a link, which must lead nobody away
-        with unfinished.open("x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
 
 
 def resuming(path: Path, task: str = tasks.DEFAULT) -> str:

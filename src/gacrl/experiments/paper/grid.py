@@ -24,6 +24,7 @@ from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import difference, estimate
 from gacrl.experiments.study import claim_folder
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.report.screen import Pace
@@ -346,7 +347,7 @@ def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
     page.heading("How this was made")
     page.code(f"gacrl sweep paper-grid --seeds {len(grid.seeds)} --episodes {grid.episodes}")
     page.write(done.out, "report")
-    (done.out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(done.out / "summary.json", done.to_dict())
 
 
 def _noise_sentence(noise: Noise, points: int, seeds: int) -> str:

@@ -3,7 +3,6 @@
 Every number and every verdict in it is computed from the runs; the sentences around them are here.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from gacrl.experiments.paper.final_metrics import interquartile
 from gacrl.experiments.paper.references import EPISODES
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.replacing import replace_json
 from gacrl.report.page import Page
 
 _INDICATIVE = 10
@@ -51,7 +51,7 @@ def write(out: Path, evidence: Evidence, judged: Sequence[Judged], seeds: int, e
         "table_3": [row.to_dict() for row in final_metrics.rows(evidence)],
         "claims": report_verdicts.results(judged),
     }
-    (out / "results.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    replace_json(out / "results.json", data, indent=1)
     return page.write(out, "report")
 
 

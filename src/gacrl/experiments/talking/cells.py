@@ -21,6 +21,7 @@ from gacrl.experiments.talking.kinds import NONE, SILENT, TOLD, num_parameters
 from gacrl.messages import interventions
 from gacrl.messages.bits import bits_sent
 from gacrl.networks.agent import matched
+from gacrl.replacing import replace_json
 from gacrl.tasks.task import MATTERS, Case, Task
 from gacrl.tasks.task import SILENT as SILENTLY
 from gacrl.tasks.task import TOLD as KNOWING
@@ -177,9 +178,7 @@ def catch(run: Planned, say: Callable[[str], None]) -> None:
         }
         for how, words in CAUGHT.items()
     }
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    unfinished.write_text(json.dumps(found) + "\n", encoding="utf-8")
-    unfinished.replace(file)
+    replace_json(file, found, indent=None)
 
 
 def played(name: str, task: str, case: Case, runs: Mapping[str, Planned]) -> Played:
