@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.config.checks import require
 from gacrl.envs.environment import Environment
@@ -52,3 +52,8 @@ def choices(env: Environment) -> ActionSet:
         turn=lambda choice, symmetry: jnp.asarray(becomes)[symmetry][choice],
         mask=lambda mask: jnp.ones((*mask.shape[:-1], len(table)), bool),
     )
+
+
+def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[Array, " N"]:
+    """The best available action of each agent."""
+    return jnp.where(action_mask, values, -jnp.inf).argmax(-1)

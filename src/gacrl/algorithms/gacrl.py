@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.q_learning import Network, Parts, message_loss
+from gacrl.algorithms.q_learner import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
 from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import GacrlConfig
