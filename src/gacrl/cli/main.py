@@ -102,8 +102,8 @@ def _answer(words: list[str]) -> int:
 
         print(f"gacrl {version()}")
         return 0
-    if words[0] not in _COMMANDS:
-        raise UserError(unknown("command", words[0], list(_COMMANDS), "see `gacrl --help`"))
+    if words[0] not in COMMANDS:
+        raise UserError(unknown("command", words[0], list(COMMANDS), "see `gacrl --help`"))
     return _run(words[0], words[1:])
 
 
@@ -132,7 +132,7 @@ def _run(command: str, words: list[str]) -> int:
             raise UserError(f"{flag} needs a value: see `gacrl {command} --help`")
         named[flag].append(value)
     if not any(named.values()):
-        return _COMMANDS[command](rest)
+        return COMMANDS[command](rest)
     if command not in _ON_TASK:
         raise UserError(f"`gacrl {command}` takes no {'--env' if named['--env'] else '--use'}")
     rest.named = named
@@ -144,7 +144,7 @@ def _run(command: str, words: list[str]) -> int:
             own.run_file(Path(file))
         for name in named["--env"]:
             rest.task = _bring(name, blame)
-        return _COMMANDS[command](rest)
+        return COMMANDS[command](rest)
 
 
 def _bring(name: str, blame: contextlib.ExitStack) -> str:
@@ -215,7 +215,7 @@ def _doctor(words: list[str]) -> int:
     return 0
 
 
-_COMMANDS: dict[str, Callable[[Any], int]] = {
+COMMANDS: dict[str, Callable[[Any], int]] = {
     "train": training.train,
     "resume": training.resume,
     "evaluate": playing.evaluate,

@@ -5,7 +5,7 @@ The same content gives the same bytes. The HTML needs nothing else: figures and 
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,11 +124,9 @@ class _Table:
         )
 
     def as_markdown(self, figures: str) -> str:
-        lines = [self.columns, ("---",) * len(self.columns)]
-        table = [" | ".join(_plain(cell) for cell in row) for row in (lines[0], *self.rows)]
-        table.insert(1, " | ".join(lines[1]))
+        columns, *rows = [[_plain(cell) for cell in row] for row in (self.columns, *self.rows)]
         caption = f"{_paragraph(self.caption)}\n\n" if self.caption else ""
-        return caption + "\n".join(f"| {line} |" for line in table)
+        return caption + markdown_table(columns, rows)
 
 
 @dataclass(frozen=True)
@@ -258,6 +256,12 @@ class Page:
 
     def _figures(self) -> list[_Figure]:
         return [block for block in self._blocks if isinstance(block, _Figure)]
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Write a table in Markdown, its cells as they are."""
+    lines = (columns, ["---"] * len(columns), *rows)
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
 
 
 def _plain(text: str) -> str:
