@@ -21,7 +21,7 @@ _FPS = 10
 
 
 def require_format(path: Path) -> None:
-    """Raises UserError, with one sentence, for a name that ends in no format that can be written here."""
+    """Raise UserError, with one sentence, for a name that ends in no format that can be written here."""
     kind = path.suffix.lower()
     if kind not in (".png", ".gif", ".mp4"):
         what = f"cannot write {kind[1:].upper()}" if kind else "its name does not say what to write"

@@ -140,7 +140,7 @@ def durations(episodes: Sequence[Episode], fps: int | float, beside: Beside | No
 
 
 def num_frames(num_steps: int) -> int:
-    """How many frames a picture has of an episode of so many steps."""
+    """Return how many frames a picture has of an episode of so many steps."""
     return min(num_steps + 1, MOST_FRAMES)
 
 

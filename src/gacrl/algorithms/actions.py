@@ -31,7 +31,10 @@ class ActionSet(NamedTuple):
 
 
 def choices(env: Environment) -> ActionSet:
-    """What the agents of this task choose among. Raises ConfigError for continuous actions that are no pushes."""
+    """Return what the agents of this task choose among.
+
+    Raises ConfigError for continuous actions that are no pushes.
+    """
     if not env.continuous_actions:
         return ActionSet(env.num_actions, lambda choice: choice, env.turn_action, lambda mask: mask)
 
@@ -55,5 +58,5 @@ def choices(env: Environment) -> ActionSet:
 
 
 def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[Array, " N"]:
-    """The best available action of each agent."""
+    """Return the best available action of each agent."""
     return jnp.where(action_mask, values, -jnp.inf).argmax(-1)

@@ -50,7 +50,7 @@ def central(
 def make(
     config: GacrlConfig, env: Environment, training: TrainingConfig, progress: str | None = None
 ) -> Algorithm:
-    """The learner for this task's shapes. progress: the task's measure that exploration follows."""
+    """Make the learner for this task's shapes. progress: the task's measure that exploration follows."""
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
     width = settings.width

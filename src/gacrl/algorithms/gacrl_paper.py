@@ -46,7 +46,7 @@ from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy,
 
 
 def behaviour_probabilities(logits: Float[Array, "*b A"], epsilon: Float[Array, ""]) -> Float[Array, "*b A"]:
-    """What the agents act by: with probability ε uniformly, else by the policy of (11).
+    """Return what the agents act by: with probability ε uniformly, else by the policy of (11).
 
     Actions with a logit of −∞ are not available: neither part of the mixture takes them.
     """
@@ -102,7 +102,7 @@ class LearnerState(NamedTuple):
 
 
 def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) -> Float[Array, "N *b"]:
-    """log π of the actions taken, by equation (11) alone: ε is not part of it."""
+    """Return log π of the actions taken, by equation (11) alone: ε is not part of it."""
     taken = jax.nn.one_hot(action, logits.shape[0], axis=0)
     return (jax.nn.log_softmax(logits, axis=0) * taken).sum(0)
 
@@ -110,7 +110,7 @@ def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) 
 def policy_loss(
     log_probability: Float[Array, "N rows"], reward: Float[Array, " rows"], batch_size: int
 ) -> Float[Array, ""]:
-    """Equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
+    """Compute equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
 
     The weight is the immediate reward, as printed: no return, no baseline, no importance ratio.
     """
@@ -119,14 +119,14 @@ def policy_loss(
 
 
 def critic_loss(value: Float[Array, " B"], reward: Float[Array, " B"]) -> Float[Array, ""]:
-    """Equation (19): the critic regresses the immediate reward."""
+    """Compute equation (19): the critic regresses the immediate reward."""
     return jnp.square(value - reward).mean()
 
 
 def kl_loss(
     mean: Float[Array, "Z N B"], log_variance: Float[Array, "Z N B"], mean_over_latent: bool = False
 ) -> Float[Array, ""]:
-    """Equation (20): without the ½, summed over the latent dimensions, averaged over agents and batch."""
+    """Compute equation (20): without the ½, summed over the latent dimensions, averaged over agents and batch."""
     loss = 2.0 * kl_divergence(mean, log_variance, axis=0).mean()
     return loss / mean.shape[0] if mean_over_latent else loss
 
@@ -139,7 +139,7 @@ def loss(
     noise: Noise,
     config: GacrlPaperConfig,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Equation (17) on B replayed rows and, as the last row, the current step.
+    """Compute equation (17) on B replayed rows and, as the last row, the current step.
 
     Latents, messages and log-probabilities are recomputed with the current weights and temperature.
     Returns the loss and its three parts.

@@ -106,7 +106,7 @@ class Noise(NamedTuple):
 def draw_noise(
     key: PRNGKey, num_agents: int, num_actions: int, config: GacrlPaperConfig, *batch: int
 ) -> tuple[Noise, Float[Array, "N A"]]:
-    """The noise of a forward pass, and Gumbel noise to choose the actions with (none for 0 actions).
+    """Return the noise of a forward pass, and Gumbel noise to choose the actions with (none for 0 actions).
 
     One draw serves all: a call of the generator costs more than the few numbers in it.
     """
@@ -162,7 +162,7 @@ def forward(
 
 
 def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*V N"]:
-    """The messages part of equation (10): concat([m_j | j ≠ i]), j ascending, whoever is near.
+    """Return the messages part of equation (10): concat([m_j | j ≠ i]), j ascending, whoever is near.
 
     received: entry [:, i, j] is j's message as it reaches i.
     """

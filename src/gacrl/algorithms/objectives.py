@@ -14,7 +14,7 @@ def clipped_surrogate(
     advantage: Float[Array, "*b"],
     clip_eps: Float[Array, ""] | float,
 ) -> Float[Array, "*b"]:
-    """PPO's clipped policy objective, to be minimised (Schulman et al. 2017, eq. 7); elementwise."""
+    """Return PPO's clipped policy objective, to be minimised (Schulman et al. 2017, eq. 7); elementwise."""
     ratio = jnp.exp(log_prob - behaviour_log_prob)
     clipped = jnp.clip(ratio, 1.0 - clip_eps, 1.0 + clip_eps)
     return -jnp.minimum(ratio * advantage, clipped * advantage)

@@ -39,7 +39,7 @@ TeamValue = Callable[[Network, AgentOutput, Int[Array, " N"], Observation], Floa
 
 
 def message_loss(output: AgentOutput, observation: Observation) -> Metrics:
-    """The loss that a kind of message has of its own, the mean over the real agents; {} for none."""
+    """Return the loss that a kind of message has of its own, the mean over the real agents; {} for none."""
     if output.message_loss is None:
         return {}
     return {"loss_messages": mean_real(output.message_loss, observation.agent_mask)}

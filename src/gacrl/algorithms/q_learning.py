@@ -38,7 +38,7 @@ from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey,
 def make(
     config: QLearningConfig, env: Environment, training: TrainingConfig, progress: str | None, parts: Parts
 ) -> Algorithm:
-    """The learner for this task's shapes. progress: the measure that exploration may follow."""
+    """Make the learner for this task's shapes. progress: the measure that exploration may follow."""
     explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
     network = eqx.filter_eval_shape(parts.networks, jax.random.key(0))
     q = Setup(
@@ -78,7 +78,7 @@ def make(
 
 
 def agents_alone(config: QLearningConfig, env: Environment) -> Callable[[PRNGKey], Network]:
-    """The networks of a learner whose team learns nothing of its own."""
+    """Return the networks of a learner whose team learns nothing of its own."""
     num_choices = choices(env).size
     settings = matched(env, config.network, num_choices)
 
@@ -95,13 +95,13 @@ def playing(averaged: bool, learner: LearnerState) -> AgentNetwork:
 
 
 def acting(learner: LearnerState) -> LearnerState:
-    """What the agents act with, without what taught them."""
+    """Return what the agents act with, without what taught them."""
     pupils = [replace(network, teacher=None) for network in (learner.network, learner.target)]
     return learner._replace(network=pupils[0], target=pupils[1], optimizer=(), replay=(), rewards=())
 
 
 def init(q: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
-    """A learner that has learned nothing."""
+    """Make a learner that has learned nothing."""
     network = redrawn(q.parts.networks(key), key)
     return LearnerState(
         network=network,
@@ -116,13 +116,13 @@ def init(q: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
 
 
 def initial_memory(q: Setup, num_agents: int) -> Memory:
-    """The policy's memory at an episode's start; () where there is none."""
+    """Return the policy's memory at an episode's start; () where there is none."""
     memory = ActMemory(q.network.agent.initial_memory(num_agents), q.explorer.initial_memory)
     return memory if jax.tree.leaves(memory) else ()
 
 
 def example(q: Setup) -> Experience:
-    """A step's shapes."""
+    """Return a step's shapes."""
     key, params = jax.random.key(0), q.env.default_params()
     state, observation = q.env.reset(key, params)
     choice = jnp.zeros(q.env.num_agents, jnp.int32)
@@ -136,7 +136,7 @@ def example(q: Setup) -> Experience:
 def epsilon_greedy(
     key: PRNGKey, values: Float[Array, "N A"], action_mask: Bool[Array, "N A"], epsilon: Float[Array, ""] | float
 ) -> Int[Array, " N"]:
-    """The best available action, or with probability ε any available one."""
+    """Return the best available action, or with probability ε any available one."""
     explore_key, action_key = jax.random.split(key)
     anything = jax.random.categorical(action_key, jnp.where(action_mask, 0.0, -jnp.inf))
     exploring = jax.random.bernoulli(explore_key, epsilon, anything.shape)
@@ -177,7 +177,9 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
 def value_now(
     q: Setup, network: Network, output: AgentOutput, best: Int[Array, " N"], observation: Observation
 ) -> Float[Array, ""] | float:
-    """The team's value of the best actions; by a teacher it is what it says without a memory, NaN once it has gone."""
+    """Return the team's value of the best actions; by a teacher it is what it says without a memory, NaN once it has
+    gone.
+    """
     if q.network.teacher is not None:
         if network.teacher is None:
             return jnp.nan
@@ -211,7 +213,7 @@ class Standing(NamedTuple):
 def gradient_step(
     q: Setup, standing: Standing, learner: LearnerState, key: PRNGKey
 ) -> tuple[LearnerState, Metrics]:
-    """One step of Adam on windows drawn from the replay; the target network follows."""
+    """Take one step of Adam on windows drawn from the replay; the target network follows."""
     replay = standing.replay
     rows_key, env_key, turn_key, noise_key = jax.random.split(key, 4)
     batch_size = q.config.batch_size

@@ -74,7 +74,7 @@ def look(q: Setup, pair: Pair, steps: Experience, keys: Array) -> Looks:
 def best_value(
     q: Setup, target: Network, theirs: AgentOutput, chooser: AgentOutput, observation: Observation
 ) -> Float[Array, " M"]:
-    """The target network's value of the actions that are best: by the online network with double Q."""
+    """Return the target network's value of the actions that are best: by the online network with double Q."""
     best = greedy((chooser if q.config.double_q else theirs).head, q.actions.mask(observation.action_mask))
     return q.parts.team_value(target, theirs, best, observation)
 
@@ -82,7 +82,7 @@ def best_value(
 def bootstrap(
     q: Setup, pair: Pair, observation: Observation, memory: Memory, target_memory: Memory
 ) -> Float[Array, " M"]:
-    """The same of an observation that is yet to be looked at."""
+    """Return the same of an observation that is yet to be looked at."""
     theirs = pair.target.judge(observation, target_memory, temperature=pair.temperature)[0]
     chooser = theirs
     if q.config.double_q:
@@ -97,7 +97,7 @@ def following(
     online: tuple[AgentOutput, Memory],
     theirs: tuple[AgentOutput, Memory],
 ) -> Float[Array, "W M"]:
-    """The value of what followed each step of a window that both networks have been unrolled along."""
+    """Return the value of what followed each step of a window that both networks have been unrolled along."""
     value = jax.vmap(lambda *now: best_value(q, pair.target, *now))(theirs[0], online[0], seen.observation)
     memories = online[1], theirs[1]
     if seen.left is not None:
@@ -113,7 +113,7 @@ def following(
 def window_loss(
     q: Setup, pair: Pair, gamma: Float[Array, ""] | float, rewards: ValueNorm, heard: Transition, looks: Looks
 ) -> tuple[Float[Array, ""], Metrics]:
-    """The loss on one window [W, …] of one environment."""
+    """Return the loss on one window [W, …] of one environment."""
     network, learned = pair.network, q.config.sequence_length
     seen = heard if network.teacher is None else as_told(heard)
     now = jax.tree.map(lambda leaf: leaf[:learned], seen)
@@ -152,7 +152,9 @@ class Ends(NamedTuple):
 
 
 def window_ends(q: Setup, seen: Transition) -> Ends:
-    """Of each learned step; where each agent's value is learned and lives end inside episodes, of every step."""
+    """Return the ends of each learned step's target; where each agent's value is learned and lives end inside episodes,
+    of every step.
+    """
     if q.parts.own_values and seen.left is not None:
         return Ends(None, jnp.arange(q.window))
     weight, last = n_step_window(seen.terminated | seen.truncated, q.config.n_step)
@@ -183,7 +185,7 @@ def window_targets(
 def loss(
     q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, batch: Experience, keys: Array
 ) -> tuple[Float[Array, ""], Metrics]:
-    """The mean over windows [W, B, …]."""
+    """Return the mean over windows [W, B, …]."""
     level = q.explorer.level(learner.exploration, learner.env_steps)
     pair = Pair(network, learner.target, level.temperature)
     one = partial(window_loss, q, pair, learner.hyper.gamma, rewards)

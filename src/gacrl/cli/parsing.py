@@ -233,7 +233,7 @@ class _Changed:
 
 
 def changed(settings: Any, words: list[str], command: str, kind: type) -> Any:
-    """A task's settings with those that `--env.X V`, or `--X V`, say.
+    """Return a task's settings with those that `--env.X V`, or `--X V`, say.
 
     kind: the arguments of the command, whose other flags may be meant. Raises UserError (ConfigError out of range).
     """

@@ -172,7 +172,8 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def recorded_bytes(env: Environment, params: EnvParams, num_episodes: int, look: Look | None = None) -> int:
-    """Memory that recorded episodes take at the least: what is seen and earned in every step up to the time limit.
+    """Return the memory that recorded episodes take at the least: what is seen and earned in every step up to the time
+    limit.
 
     Counted from shapes: nothing is played.
     """
@@ -236,7 +237,7 @@ def play(
     intervention: Intervention | None = None,
     look: Look | None = None,
 ) -> Played:
-    """What `record_many` compiles: K environments from their start to the time limit."""
+    """Play what `record_many` compiles: K environments from their start to the time limit."""
 
     def one_step(
         carry: rollout.Carry, key: PRNGKey

@@ -142,7 +142,9 @@ def ablate(
 
 
 def plan(config: RunConfig, out: Path, parts: Sequence[str]) -> list[Planned]:
-    """The run with all parts, and one without each; the yoked one lacks the levels, which the first will give."""
+    """Return the run with all parts, and one without each; the yoked one lacks the levels, which the first will
+    give.
+    """
     wanted, known = num_parameters(config), parts_of(config)
     runs = [Planned(FULL, config, out / "all-parts")]
     for name in parts:

@@ -62,7 +62,7 @@ def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
 
 
 def refuse_other_settings(runs: Sequence[Planned]) -> None:
-    """Raises UserError where a run's folder holds a run with other settings than planned."""
+    """Raise UserError where a run's folder holds a run with other settings than planned."""
     for planned in runs:
         folder = planned.folder
         if (folder / "config.json").is_file() and RunFolder.open(folder).config() != planned.config:

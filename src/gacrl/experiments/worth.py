@@ -31,7 +31,7 @@ def worths(task: Task, whole: Finals, without: Finals) -> dict[str, Worth]:
 
 
 def remarkable(found: Mapping[str, Worth]) -> dict[str, Worth]:
-    """Those of which something may be said."""
+    """Return those of which something may be said."""
     return {metric: worth for metric, worth in found.items() if worth.said}
 
 

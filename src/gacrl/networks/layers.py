@@ -56,7 +56,7 @@ class Score(eqx.Module):
 
 
 def rectified(x: Float[Array, "*b"], slope: float = 0.0) -> Float[Array, "*b"]:
-    """x where it is positive, else slope · x: a ReLU, or a leaky one (Maas et al. 2013)."""
+    """Return x where it is positive, else slope · x: a ReLU, or a leaky one (Maas et al. 2013)."""
     return jax.nn.leaky_relu(x, slope) if slope else jax.nn.relu(x)
 
 
@@ -137,5 +137,5 @@ def _orthogonal(normal: Float[Array, "out in"]) -> Float[Array, "out in"]:
 
 
 def num_parameters(network: eqx.Module) -> int:
-    """How many numbers a network learns."""
+    """Return how many numbers a network learns."""
     return sum(leaf.size for leaf in jax.tree.leaves(network))

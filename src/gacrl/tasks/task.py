@@ -168,13 +168,15 @@ class Task(NamedTuple):
     """One line on what must be done, for `gacrl tasks`."""
 
     def metric(self, name: str) -> Metric:
-        """The metric of that name; of a `score_` that of the number which it scales, and of a bare measure its mean."""
+        """Return the metric of that name; of a `score_` that of the number which it scales, and of a bare measure its
+        mean.
+        """
         plain = name.removeprefix("score_")
         found = self.metrics.get(plain) or RETURN.get(plain) or Metric(plain)
         return found._replace(higher_is_better=True) if plain != name else found
 
     def shown(self, measured: Sequence[str]) -> dict[str, str]:
-        """The metrics of tables among those that are measured, headline first, and what they are called there.
+        """Return the metrics of tables among those that are measured, headline first, and what they are called there.
 
         Of a task that defines no metrics all are shown.
         """
@@ -185,17 +187,17 @@ class Task(NamedTuple):
         return {name: label for name, label in labels.items() if name in measured}
 
     def numbers(self, settings: Settings, env: Any, gamma: float = 1.0, padded: bool = False) -> EnvParams:
-        """What `params` says; where the record says nothing, what the environment has."""
+        """Return what `params` says; where the record says nothing, what the environment has."""
         return env.default_params() if self.params is no_params else self.params(settings, gamma, padded)
 
     def with_horizon(self, settings: Settings, steps: int) -> Settings:
-        """The settings with episodes of so many steps. Raises ConfigError where the task has a fixed length."""
+        """Return the settings with episodes of so many steps. Raises ConfigError where the task has a fixed length."""
         if "max_cycles" not in {field.name for field in fields(settings)}:
             raise ConfigError(f"{self.name} has no setting max_cycles: its episodes have a length of their own")
         return replace(settings, max_cycles=steps)
 
     def facts(self, settings: Settings, measured: Sequence[str]) -> dict[str, Any]:
-        """What a comparison must know of the task as it is set, as plain data: it stands in every summary.
+        """Return what a comparison must know of the task as it is set, as plain data: it stands in every summary.
 
         measured: the names of the metrics that episodes have.
         """

@@ -69,7 +69,7 @@ def linear(config: CurriculumConfig, task: Task, settings: Any) -> Curriculum:
 
 
 def make(config: CurriculumConfig, task: Task, settings: Any, params: EnvParams) -> Curriculum:
-    """The curriculum that settings of the run and of the task ask for.
+    """Make the curriculum that settings of the run and of the task ask for.
 
     Raises ConfigError for a gate where nothing moves, or where the task does not say what progress is.
     """

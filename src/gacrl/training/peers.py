@@ -52,7 +52,7 @@ class Line:
             self._connection.sendall((json.dumps(words) + "\n").encode())
 
     def hear(self, seconds: float | None = None) -> dict[str, Any] | None:
-        """What comes next; None when the line is dead, says nothing in this time, or speaks another language."""
+        """Return what comes next; None when the line is dead, says nothing in this time, or speaks another language."""
         try:
             self._connection.settimeout(seconds)
             words = json.loads(self._reader.readline())

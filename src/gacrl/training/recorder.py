@@ -41,7 +41,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path | None, config: RunConfig, begun_from: str | None = None) -> "RunFolder":
-        """A new run folder. Without a path: the next free number under `runs/`.
+        """Make a new run folder. Without a path: the next free number under `runs/`.
 
         begun_from: the run whose policy this one starts with. Raises UserError where the path exists already, or cannot
         be written.
@@ -69,7 +69,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run folder. Raises UserError where there is none."""
+        """Open an existing run folder. Raises UserError where there is none."""
         if not path.exists():
             raise UserError(f"there is no run {path}: `gacrl train` makes one and prints where it is")
         if not _is_run(path):
@@ -87,7 +87,7 @@ class RunFolder:
                 raise UserError(f"{path} is a {found}, and stands where a {wanted} belongs: move it away")
 
     def config(self) -> RunConfig:
-        """The settings that the run was started with. Raises UserError, also for a task that is not at hand."""
+        """Read the settings that the run was started with. Raises UserError, also for a task that is not at hand."""
         try:
             return configuration.load(self.config_file)
         except ConfigError as error:
@@ -137,7 +137,7 @@ class RunFolder:
             warn(f"{source} has changed since {self.path} was made: the task is played as it is now")
 
     def settings(self) -> dict[str, Any]:
-        """The same as they stand in the file: a version that knows more settings does not add to them."""
+        """Return the same as they stand in the file: a version that knows more settings does not add to them."""
         self.config()  # refuses what is no configuration
         return json.loads(self.config_file.read_text(encoding="utf-8"))
 
@@ -180,7 +180,7 @@ class RunFolder:
             os.fsync(file.fileno())
 
     def metrics(self) -> list[dict[str, Any]]:
-        """Every row that was written; a last line that a crash cut off is left out.
+        """Return every row that was written; a last line that a crash cut off is left out.
 
         Raises UserError for a damaged line before the last, by its number.
         """
@@ -219,7 +219,7 @@ class RunFolder:
         replace_json(self.diverged_file, {"because": because}, indent=None)
 
     def why_diverged(self) -> str | None:
-        """Why the run diverged; None where it did not. Raises UserError for a damaged file."""
+        """Return why the run diverged; None where it did not. Raises UserError for a damaged file."""
         if not self.diverged_file.is_file():
             return None
         try:
@@ -231,7 +231,7 @@ class RunFolder:
 
 
 def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
-    """The command that goes on with a run, to copy: whatever its folder is called."""
+    """Return the command that goes on with a run, to copy: whatever its folder is called."""
     return f"gacrl resume {shlex.quote(str(path))}{tasks.flag(task)}"
 
 

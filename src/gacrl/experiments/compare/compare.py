@@ -123,17 +123,17 @@ class Comparison:
     """What a reader must know before believing it, a sentence each."""
 
     def reference(self, who: str, metric: str) -> float:
-        """What one of those gets; of a score, on its scale."""
+        """Return what one of those gets; of a score, on its scale."""
         return on_scale(self.references[who], self.references, metric, self.facts["scale"])
 
     def label(self, metric: str) -> str:
-        """What tables call it."""
+        """Return what tables call it."""
         score, name = metric.startswith("score_"), metric.removeprefix("score_")
         label = self.facts["shown"].get(name, name.replace("_", " "))
         return f"score of {label}" if score else label
 
     def axis(self, metric: str) -> str:
-        """The same for the axis of a figure: with its unit; of a score with what its ends mean."""
+        """Return the same for the axis of a figure: with its unit; of a score with what its ends mean."""
         if metric.startswith("score_"):
             low, high = self.facts["scale"]
             return f"{self.label(metric)} (0: {low}, 1: {high})"
@@ -141,7 +141,7 @@ class Comparison:
         return f"{self.label(metric)} ({unit})" if unit else self.label(metric)
 
     def lower_is_better(self, metric: str) -> bool:
-        """Whether less of it is more."""
+        """Return whether less of it is more."""
         return metric in self.facts["lower_is_better"]
 
     @property

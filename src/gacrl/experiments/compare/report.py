@@ -50,7 +50,9 @@ class _Listing(NamedTuple):
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """The tables and what must be known beside them, on standard output; on a narrow screen blocks in their place."""
+    """Print the tables and what must be known beside them, on standard output; on a narrow screen blocks in their
+    place.
+    """
     screen = console()
     for listing in listings(comparison, _SHOWN_DIFFERENCES):
         screen.print(listing.caption, overflow="fold")
@@ -63,7 +65,7 @@ def print_comparison(comparison: Comparison) -> None:
 
 
 def titled(comparison: Comparison, metric: str) -> str:
-    """What tables call a metric, and its name where that is another."""
+    """Return what tables call a metric, and its name where that is another."""
     label = comparison.label(metric)
     return label if label == metric else f"{label}: {metric}"
 
@@ -77,7 +79,7 @@ def about(comparison: Comparison) -> str:
 
 
 def listings(comparison: Comparison, most: int | None) -> list[_Listing]:
-    """The tables; at most so many differing settings, None: all."""
+    """Return the tables; at most so many differing settings, None: all."""
     listings = [_results(comparison)]
     for metric in comparison.metrics if comparison.pairs else ():
         better = "lower" if comparison.lower_is_better(metric) else "higher"
@@ -186,7 +188,7 @@ def _verdict(pair: Pair, lower_is_better: bool) -> str:
 
 
 def explained(comparison: Comparison) -> list[tuple[str, str]]:
-    """What the columns of the differences mean, those that are there."""
+    """Return what the columns of the differences mean, those that are there."""
     says = "whether two one-sided tests show at 5 % that the means differ by less; p is the larger of theirs"
     return [*_PAIR_EXPLAINED, *((f"equivalent within {margin:g}", says) for margin in _margins(comparison.pairs))]
 

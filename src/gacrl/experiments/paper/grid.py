@@ -120,7 +120,10 @@ class Sweep:
 
 
 def paper_grid(seeds: SupportsIndex = 2, episodes: SupportsIndex = 500) -> Grid:
-    """The paper's 27 points, by shaped reward over the first 500 episodes. Raises UserError for impossible sizes."""
+    """Return the paper's 27 points, by shaped reward over the first 500 episodes.
+
+    Raises UserError for impossible sizes.
+    """
     seeds, episodes = whole(seeds, "seeds"), whole(episodes, "episodes")
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no telling noise from merit")
@@ -180,7 +183,7 @@ def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | No
 
 
 def noise_of(scores: np.ndarray) -> Noise:
-    """The spread of the means of scores [points, seeds] beside what chance would make of it.
+    """Return the spread of the means of scores [points, seeds] beside what chance would make of it.
 
     All points have the same seeds, and so the same starts: a seed's own luck is no part of their differences
     (two-way layout without interaction).
@@ -197,7 +200,7 @@ def noise_of(scores: np.ndarray) -> Noise:
 
 
 def expected_range(count: int) -> float:
-    """The mean of the largest less the smallest of so many standard normal numbers."""
+    """Return the mean of the largest less the smallest of so many standard normal numbers."""
     x = np.linspace(-9.0, 9.0, 20_001)
     below = stats.norm.cdf(x)
     return float(np.trapezoid(1 - below**count - (1 - below) ** count, x))

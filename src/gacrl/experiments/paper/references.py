@@ -37,7 +37,7 @@ Episodes = Mapping[str, Float[np.ndarray, " E"]]
 
 
 def difficulty(numbers: Mapping[str, float]) -> Difficulty:
-    """The difficulty in a row of `metrics.jsonl`."""
+    """Return the difficulty in a row of `metrics.jsonl`."""
     return float(numbers["local_ratio"]), float(numbers["coverage_threshold"])
 
 

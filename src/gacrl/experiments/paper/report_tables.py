@@ -190,7 +190,7 @@ def _printed_peaks() -> list[float]:
 
 
 def environment_svg() -> str:
-    """The paper's Figure 1: a start of the environment, as SVG."""
+    """Return the paper's Figure 1: a start of the environment, as SVG."""
     import matplotlib
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle

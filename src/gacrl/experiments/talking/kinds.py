@@ -93,7 +93,7 @@ def _counted(task: str, settings: Any, network: NetworkConfig, draws: bool) -> i
 
 
 def sends(communication: str, shared: Base) -> RunConfig:
-    """The learner with another kind of messages, or with none."""
+    """Return the learner with another kind of messages, or with none."""
     return hears_by(communication, shared.talking, shared.parameters)
 
 

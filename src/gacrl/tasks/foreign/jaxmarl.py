@@ -163,7 +163,7 @@ class JaxmarlTask(Padded):
         return jnp.stack([jnp.pad(row, (0, self.num_actions - row.size)) for row in rows])
 
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors; each agent may do what it can."""
+        """Return the observation around bare feature vectors; each agent may do what it can."""
         return observe(features, available=jnp.asarray(self.layout.mask))
 
     def unstack(self, actions: Int[Array, " N"] | np.ndarray) -> list[Any]:

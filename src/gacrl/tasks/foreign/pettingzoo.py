@@ -216,7 +216,7 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
         return state, after._replace(info={"reward_raw": jnp.zeros(())})
 
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors; each agent may do what it can."""
+        """Return the observation around bare feature vectors; each agent may do what it can."""
         return observe(features, available=jnp.asarray(self.layout.mask))
 
     def stack(self, rows: Any) -> Float[np.ndarray, "N O"]:

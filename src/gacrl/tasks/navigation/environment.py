@@ -88,7 +88,7 @@ class Navigation(Environment):
         return self.num_agents - 1 if self.rules.bodies else 0
 
     def default_params(self) -> NavigationParams:
-        """The numbers of the settings, as data to every compiled program."""
+        """Return the numbers of the settings, as data to every compiled program."""
         params = NavigationParams(Physics(), self.local_ratio, self.goal_bonus)
         return jax.tree.map(lambda number: jnp.asarray(number, float), params)
 

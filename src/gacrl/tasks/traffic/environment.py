@@ -78,7 +78,7 @@ class TrafficJunction(TrafficSettings, Environment):  # pyright: ignore[reportIn
         return len(self.roads.routes) + len(self.roads.cells) + 1 + (2 * self.vision + 1) ** 2
 
     def default_params(self) -> TrafficParams:
-        """The level's numbers."""
+        """Return the level's numbers."""
         return TrafficParams(jnp.asarray(LEVELS[self.level].arrival, float))
 
     def reset(self, key: PRNGKey, params: TrafficParams | None = None) -> tuple[TrafficState, Observation]:
