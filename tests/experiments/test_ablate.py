@@ -63,7 +63,7 @@ def test_what_talks_has_parts_of_its_own(tmp_path: Path):
     """A told critic among them; agents without messages have nobody whom it could teach to talk."""
     talking = configuration.on_task(presets.preset(usual_preset("reference")), "reference")
     assert (talking.preset, usual_preset("spread"), usual_preset(None)) == (
-        "gacrl-talk",
+        "gacrl",
         "gacrl-112k",
         "gacrl-112k",
     )

@@ -10,7 +10,7 @@ from gacrl.config.run import RunConfig
 from gacrl.tasks.task import Part
 
 NO_MESSAGES, YOKED = "no-messages", "yoked-exploration"
-PRESET, TALKING_PRESET = "gacrl-112k", "gacrl-talk"
+PRESET, TALKING_PRESET = "gacrl-112k", "gacrl"
 """What is taken apart where nobody says: on most tasks, and on those that need talk."""
 
 
@@ -67,4 +67,4 @@ def parts_of(config: RunConfig) -> dict[str, Part]:
 
 def usual_preset(task: str | None) -> str:
     """Return the preset that is taken apart on a task where nobody says which; None: no task is named."""
-    return TALKING_PRESET if task is not None and tasks.find(task).cases else PRESET
+    return TALKING_PRESET if task is not None and tasks.find(task).needs_talk else PRESET
