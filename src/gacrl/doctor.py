@@ -43,6 +43,8 @@ class Trial(NamedTuple):
 
 
 class Finding(NamedTuple):
+    """What a check has found."""
+
     what: str
     good: bool
     detail: str

@@ -93,6 +93,8 @@ class Hyper(NamedTuple):
 
 
 class LearnerState(NamedTuple):
+    """What the paper's GACRL carries from update to update."""
+
     network: Network
     optimizer: optax.OptState
     replay: ring.Replay[Float[Array, "capacity W"]]

@@ -90,6 +90,8 @@ class Critic(eqx.Module):
 
 
 class Network(eqx.Module):
+    """All that is learned: equations (2) to (12)."""
+
     encoder: Encoder
     message_model: MessageModel
     policy: PolicyNetwork

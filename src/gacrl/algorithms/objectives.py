@@ -39,17 +39,21 @@ class ValueNorm(NamedTuple):
 
     @property
     def mean(self) -> Float[Array, ""]:
+        """The mean of the returns seen."""
         return self.first / jnp.maximum(self.weight, 1e-5)
 
     @property
     def sd(self) -> Float[Array, ""]:
+        """Their standard deviation, at least .01; 1 before any was seen."""
         variance = self.second / jnp.maximum(self.weight, 1e-5) - jnp.square(self.mean)
         return jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
 
     def normalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        """Return values in standard deviations around the mean."""
         return (values - self.mean) / self.sd
 
     def denormalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        """Return normalised values in the unit of the returns."""
         return values * self.sd + self.mean
 
 

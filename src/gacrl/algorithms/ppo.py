@@ -41,6 +41,8 @@ from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey,
 
 
 class Network(eqx.Module):
+    """What is learned; actor and critic share nothing."""
+
     actor: AgentNetwork
     critic: Critic
 
@@ -69,6 +71,8 @@ class Hyper(NamedTuple):
 
 
 class LearnerState(NamedTuple):
+    """What PPO carries from update to update."""
+
     network: Network
     optimizer: optax.OptState
     norm: ValueNorm
@@ -332,7 +336,7 @@ def normalised(advantage: Float[Array, "T E N"], real: Bool[Array, "T E N"]) -> 
 
 
 def gradients_on(p: Setup, whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
-    """Of these rows' part of the loss; count: the real agents of the whole minibatch."""
+    """Differentiate these rows' part of the loss; count: the real agents of the whole minibatch."""
     network, sample, memory, hyper, ent_coef, count, temperature = whole
     part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
     remembered = jax.tree.map(lambda leaf: leaf[rows], memory)

@@ -119,6 +119,8 @@ class Hyper(NamedTuple):
 
 
 class LearnerState(NamedTuple):
+    """What Q-learning carries from update to update."""
+
     network: Network
     target: Network
     optimizer: optax.OptState

@@ -339,7 +339,7 @@ def _episode(played: Played, k: int) -> Episode:
 
 
 def sized(scene: Scene | None) -> Scene | None:
-    """Agents without a radius get one that suits the picture: a twentieth of the way that all of them cover."""
+    """Give agents without a radius one that suits the picture: a twentieth of the way that all of them cover."""
     if scene is None or scene.agents.radius.any():
         return scene
     places = scene.agents.positions.reshape(-1, 2)

@@ -22,7 +22,7 @@ FLOORS = ("random", "noop")
 
 
 def random(env: Environment) -> Actor:
-    """Every available action is equally likely."""
+    """Act at random: every available action is equally likely."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
@@ -35,7 +35,7 @@ def random(env: Environment) -> Actor:
 
 
 def noop(env: Environment) -> Actor:
-    """Every agent takes its first available action, or pushes nowhere."""
+    """Do nothing: every agent takes its first available action, or pushes nowhere."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:

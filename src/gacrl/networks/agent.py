@@ -34,6 +34,8 @@ class AgentMemory(NamedTuple):
 
 
 class AgentOutput(NamedTuple):
+    """What the network gives for N agents in one step: A outputs, H features, R rounds of messages."""
+
     head: Float[Array, "N A"]
     hidden: Float[Array, "N H"]
     messages: Float[Array, "R N V"] | None

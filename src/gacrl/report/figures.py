@@ -277,7 +277,7 @@ def paths(
     ylabel: str,
     styles: Mapping[str, Look] | None = None,
 ) -> str:
-    """For each name the way of each seed through a plane, x [P] and y [P], to a marker where it ends; SVG.
+    """Draw for each name the way of each seed through a plane, x [P] and y [P], to a marker where it ends; SVG.
 
     styles: from `looks`.
     """

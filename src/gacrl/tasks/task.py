@@ -82,22 +82,22 @@ class Case(NamedTuple):
 
 
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
-    """Nothing about the task is a number that could change between steps."""
+    """Return no numbers: nothing about the task could change between steps."""
     return ()
 
 
 def unchanged(settings: Settings, params: EnvParams, share: Any) -> EnvParams:
-    """The task is as difficult at the start as at the end."""
+    """Return the numbers as they are: the task is as difficult at the start as at the end."""
     return params
 
 
 def complete(settings: Settings) -> bool:
-    """All agents are there from an episode's start to its end."""
+    """Say that all agents are there from an episode's start to its end."""
     return False
 
 
 def unnamed(settings: Settings) -> Sequence[str]:
-    """The task does not say what its actions are called."""
+    """Return no names: the task does not say what its actions are called."""
     return ()
 
 

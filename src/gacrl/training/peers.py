@@ -86,7 +86,7 @@ class Peers:
         self._say(mend=mend)
 
     def leave(self) -> None:
-        """This process has done its part. Process 0 goes when the others have heard so, the others when it has.
+        """Leave, this process having done its part: process 0 when the others have heard so, the others when it has.
 
         A line that closes with something unread resets, and what its other end had not read yet is lost.
         """

@@ -103,7 +103,7 @@ def formula(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def stated_once(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """A setting that the paper states in several places is the same in all."""
+    """Judge whether a setting that the paper states in several places is the same in all."""
     stated: Mapping[str, Sequence[float]] = claim.settings["stated"]
     because = "; ".join(f"{place}: {start:g} to {end:g}" for place, (start, end) in stated.items())
     compared = 1 if reading.sense == "start" else 2

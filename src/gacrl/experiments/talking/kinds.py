@@ -142,7 +142,7 @@ def remembering(shared: Base) -> RunConfig | None:
 
 
 def uttering(shared: Base) -> RunConfig | None:
-    """Agents whose words are actions."""
+    """Make the settings of agents whose words are actions."""
     if shared.case.utterances is None:
         return None
     silent = sends(NONE, shared)

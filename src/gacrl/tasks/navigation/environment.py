@@ -23,6 +23,8 @@ MOVES = len(DIRECTIONS)
 
 
 class NavigationState(NamedTuple):
+    """N agents and L landmarks; lengths and velocities in MPE2's units."""
+
     positions: Float[Array, "N 2"]
     velocities: Float[Array, "N 2"]
     landmarks: Float[Array, "L 2"]

@@ -89,6 +89,8 @@ def params_of(settings: SpreadSettings, gamma: float = 1.0, padded: bool = False
 
 
 class SpreadState(NamedTuple):
+    """N agents and L landmarks; lengths and velocities in MPE2's units."""
+
     positions: Float[Array, "N 2"]
     velocities: Float[Array, "N 2"]
     landmarks: Float[Array, "L 2"]
@@ -200,7 +202,7 @@ class Spread(SpreadSettings, Environment):
         return one(state.positions, state.landmarks)
 
     def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, "N *e"]:
-        """MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
+        """Return MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
         _, to_landmarks = pairwise_offsets(state.positions, state.landmarks)
         shared = -_masked(_over_agents(to_landmarks, params), params.landmark_mask).sum(0)
         own = -params.collision_penalty * _touching(state.positions, params).sum(1)

@@ -30,11 +30,15 @@ NOBODY = -1
 
 
 class TrafficParams(NamedTuple):
+    """The number of the task that difficulty moves."""
+
     arrival: Float[Array, ""] | float
     """Probability that a car arrives at an entry in a step."""
 
 
 class TrafficState(NamedTuple):
+    """The cars, a slot each."""
+
     there: Bool[Array, " N"]
     """Whether a slot holds a car."""
     route: Int[Array, " N"]
