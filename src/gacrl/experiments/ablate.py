@@ -24,7 +24,7 @@ from gacrl.evaluation.statistics import (
 )
 from gacrl.experiments import results
 from gacrl.experiments.parts import NO_MESSAGES, YOKED, parts_of
-from gacrl.experiments.provenance import Versions, commits, doubts, made_by
+from gacrl.experiments.provenance import Versions, code_of, doubts, made_by
 from gacrl.experiments.results import Finals, Values, reading, why_diverged
 from gacrl.experiments.study import (
     Planned,
@@ -252,7 +252,7 @@ def _report(
     _exploration(page, task, ended)
     page.heading("How this was made")
     page.code(_command(config, outcomes))
-    page.text(f"Code of commit {', '.join(commits(made))}.")
+    page.text(code_of(made))
     return page.write(out, "report")
 
 

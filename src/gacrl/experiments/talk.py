@@ -27,7 +27,7 @@ from gacrl.evaluation.statistics import (
     with_interval,
 )
 from gacrl.experiments import scoring
-from gacrl.experiments.provenance import Versions, commits, doubts, made_by
+from gacrl.experiments.provenance import Versions, code_of, doubts, made_by
 from gacrl.experiments.results import Finals, Values, why_diverged
 from gacrl.experiments.study import (
     Planned,
@@ -291,7 +291,7 @@ def _report(done: Talk) -> Page:
         "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
     )
     page.code(_command(config, done.known))
-    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
+    page.text(code_of(done.made_by))
     return page
 
 

@@ -1,15 +1,14 @@
 """A comparison in tables, and on the terminal."""
 
-import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import Equivalence, with_interval
-from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair
+from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair, show
 from gacrl.experiments.compare.finished import closing_value
 from gacrl.experiments.compare.groups import Group
 from gacrl.report.screen import console
@@ -95,7 +94,7 @@ def listings(comparison: Comparison, most: int | None) -> list[_Listing]:
         # What makes the comparison unequal stands first.
         differing.sort(key=lambda item: item[0] not in comparison.unequal_switches)
         rows = [
-            (name + (" *" if name in comparison.unequal_switches else ""), *map(_value, values))
+            (name + (" *" if name in comparison.unequal_switches else ""), *map(show, values))
             for name, values in differing[:most]
         ]
         left = len(differing) - len(rows)
@@ -195,7 +194,3 @@ def explained(comparison: Comparison) -> list[tuple[str, str]]:
 
 def _equivalence(test: Equivalence) -> str:
     return f"{'yes' if test.equivalent else 'not shown'} (p={test.p_value:.2g})"
-
-
-def _value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)

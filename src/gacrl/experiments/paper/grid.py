@@ -23,7 +23,7 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import difference, estimate
-from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.experiments.provenance import Versions, code_of, doubts
 from gacrl.experiments.study import claim_folder
 from gacrl.replacing import replace_json
 from gacrl.report import figures
@@ -376,7 +376,7 @@ def _report(grid: Grid, done: Sweep) -> None:
     page.table(("learning rate", "ε₀", "τ₀", "mean", "seeds", ""), rows)
     page.heading("How this was made")
     page.code(f"gacrl sweep paper-grid --seeds {len(grid.seeds)} --episodes {grid.episodes}")
-    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
+    page.text(code_of(done.made_by))
     page.write(done.out, "report")
     replace_json(done.out / "summary.json", done.to_dict())
 

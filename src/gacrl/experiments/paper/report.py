@@ -18,7 +18,7 @@ from gacrl.experiments.paper.evidence import COLUMNS, Evidence
 from gacrl.experiments.paper.final_metrics import interquartile
 from gacrl.experiments.paper.references import EPISODES
 from gacrl.experiments.paper.tables import SCRIPTED
-from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.experiments.provenance import Versions, code_of, doubts
 from gacrl.replacing import replace_json
 from gacrl.report.page import Page
 
@@ -145,7 +145,7 @@ def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
         for (column, who), series in evidence.series.items()
     ]
     page.table(("who", "trained on", "seeds", "steps a seed", "time, all seeds", "settings"), rows)
-    page.text(f"Code of commit {', '.join(commits(_made_by(evidence)))}.")
+    page.text(code_of(_made_by(evidence)))
 
 
 def _settings(config: RunConfig) -> str:
