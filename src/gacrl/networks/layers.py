@@ -91,7 +91,8 @@ def redrawn(network: Net, key: PRNGKey) -> Net:
     """Give the layers of a network their first numbers anew, all of them from one draw.
 
     A draw a layer, which is what their constructors make, is a loop a layer to compile: that was most of what makes a
-    training state. What is in no `Linear` and no `Score` stays as it is.
+    training state. What is in no `Linear` and no `Score` stays as it is: constants, and TarMAC's signatures, drawn by a
+    split of the same key. Another key for either would change the first numbers of stored runs.
     """
     nodes, tree = jax.tree.flatten(network, is_leaf=_is_layer)
     layers = [node for node in nodes if _is_layer(node)]
