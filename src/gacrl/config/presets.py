@@ -118,6 +118,7 @@ _GACRL_NETWORK = NetworkConfig(
     symbols="soft",
     symbol_noise=0.0,
     second_look=True,
+    seen_slope=0.1,
     heard_slope=0.1,
     logit_price=0.01,
 )

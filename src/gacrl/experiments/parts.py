@@ -38,6 +38,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         ),
         "no-second-look": Part("nothing is looked at after the messages", _network(second_look=False)),
         "blunt-look": Part("the second look's attention as wide as usual", _network(look_sharpness=1.0)),
+        "no-seen-slope": Part("ReLUs over landmarks, which can lose sight of some", _network(seen_slope=0.0)),
         "no-heard-slope": Part("ReLUs that hear, which can fall silent", _network(heard_slope=0.0)),
         "no-logit-price": Part("large logits of symbols cost nothing", _network(logit_price=0.0)),
         "warm-symbols": Part("τ stays at 1", _algorithm(temperature=1.0, temperature_end=1.0)),
