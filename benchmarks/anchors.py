@@ -38,9 +38,9 @@ def anchors(task: Task, episodes: int) -> dict[str, Any]:
     comparable = task.facts(settings, [])["comparable"]
     found = {who: measured(task, settings, who, episodes) for who in ("random", SILENT, TOLD)}
     trained = {who: trained.get(who) for who in (SILENT, TOLD)}
-    pick = max if task.metric(task.headline).higher_is_better else min
+    sign = task.metric(task.headline).sign
     scores = {
-        who: pick(known[task.headline] for known in (scripted, trained.get(who)) if known is not None)
+        who: sign * max(sign * known[task.headline] for known in (scripted, trained.get(who)) if known is not None)
         for who, scripted in found.items()
     }
     return {

@@ -22,7 +22,17 @@ TASKS = tuple(f"tasks.{path.parent.name}" for path in sorted((PACKAGE / "tasks")
 SETTINGS_OF_TASKS = tuple(f"{task}.settings" for task in TASKS)
 
 LAYERS = (
-    ("errors", "extras", "types", "versions", "config", "tasks", "evaluation.statistics", *SETTINGS_OF_TASKS),
+    (
+        "errors",
+        "extras",
+        "replacing",
+        "types",
+        "versions",
+        "config",
+        "tasks",
+        "evaluation.statistics",
+        *SETTINGS_OF_TASKS,
+    ),
     (
         "cli.arguments",
         "envs",

@@ -53,9 +53,9 @@ def test_every_command_of_the_documents_and_of_help_is_understood(only_parsed: N
     texts = [page.read_text(encoding="utf-8") for page in written]
     texts += [cli.OVERVIEW, *(kind.__doc__ or "" for kind in vars(arguments).values() if isinstance(kind, type))]
     said = [words for text in texts for words in commands(text) if "--config" not in words]
-    assert {words[0] for words in said} >= set(cli._COMMANDS), "every command has an example"
+    assert {words[0] for words in said} >= set(cli.COMMANDS), "every command has an example"
     for words in map(list, dict.fromkeys(map(tuple, said))):  # each once
-        if words[0] in cli._COMMANDS and len(words) > 1 and "--help" not in words:
+        if words[0] in cli.COMMANDS and len(words) > 1 and "--help" not in words:
             with pytest.raises(Understood):
                 assert cli.main(words) == 0, f"gacrl {' '.join(words)}"
 

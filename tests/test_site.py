@@ -62,7 +62,7 @@ def test_the_tour_is_kept_without_what_it_gave():
 
 
 def test_every_command_has_a_page_with_its_help():
-    for name in cli._COMMANDS:
+    for name in cli.COMMANDS:
         page = (SITE / "commands" / f"{name}.md").read_text(encoding="utf-8")
         assert page.startswith(f"# gacrl {name}\n")
         assert f"```{{run}}\ngacrl {name} --help\n```" in page

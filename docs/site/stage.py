@@ -18,6 +18,8 @@ from pathlib import Path
 import blocks
 import notebook
 
+from gacrl.cli.main import COMMANDS
+
 ROOT = blocks.ROOT
 SITE = ROOT / "docs" / "site"
 MOVED = {
@@ -157,9 +159,7 @@ def main(folder: Path) -> None:
 
 def _in_order(written: list[Path]) -> list[Path]:
     """Return pages in the order in which their commands run: those of commands as `gacrl --help` lists them."""
-    from gacrl.cli.main import OVERVIEW
-
-    listed = [line.split()[0] for line in OVERVIEW.splitlines() if line.startswith("  ")]
+    listed = list(COMMANDS)
     names = {page: listed.index(page.stem) for page in written if page.parent.name == "commands"}
     return sorted(written, key=lambda page: names.get(page, len(listed)))
 

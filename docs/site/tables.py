@@ -1,7 +1,6 @@
 """What the site shows of files and of the package: scores, studies, settings, docstrings."""
 
 import json
-from collections.abc import Iterable
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,11 @@ from sphinx.pycode import ModuleAnalyzer
 import gacrl
 from gacrl import tasks
 from gacrl.evaluation.statistics import estimate
+from gacrl.report.page import markdown_table
 
 COLUMNS = 3
 """Metrics in a table of scores: the first ones of the task's own tables."""
 DOCS = Path(__file__).resolve().parent.parent
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in Markdown."""
-    head = list(head)
-    marks = [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
-    return "\n".join(marks)
 
 
 def number(value: float) -> str:
@@ -48,7 +41,7 @@ def scores(task: str, files: list[str]) -> str:
         made = f"`{summary['command']}`" if "command" in summary else "[results](/results.md)"
         steps = f"{len(summary['seeds'])} × {summary['env_steps']:,}"
         rows.append([f"[`{summary['preset']}`](/data/{file}.json)", steps, *cells, made])
-    return table(["policy", "seeds × steps", *shown.values(), "made by"], rows)
+    return markdown_table(["policy", "seeds × steps", *shown.values(), "made by"], rows)
 
 
 def _command(known: dict[str, Any], who: str) -> str:
@@ -67,7 +60,9 @@ def study(file: str, _: list[str]) -> str:
     """Return the returns that a study of `gacrl talk` found, every seed."""
     found = json.loads((DOCS / "data" / f"{file}.json").read_text(encoding="utf-8"))
     rows = {**found["returns"], **{f"talking, {how}": values for how, values in found["played"].items()}}
-    return table(["learner", "return, every seed"], ([who, " ".join(map(number, of))] for who, of in rows.items()))
+    return markdown_table(
+        ["learner", "return, every seed"], ([who, " ".join(map(number, of))] for who, of in rows.items())
+    )
 
 
 def settings(task: str, _: list[str]) -> str:

@@ -43,6 +43,8 @@ class Trial(NamedTuple):
 
 
 class Finding(NamedTuple):
+    """What a check has found."""
+
     what: str
     good: bool
     detail: str
@@ -104,7 +106,7 @@ def _same_world() -> Iterator[Finding]:
 
 
 def trial(algorithm: AlgorithmConfig) -> Trial:
-    """The algorithm as it is taken to the probes: for tiny tasks its network is narrow, its windows are short, and
+    """Make the algorithm as it is taken to the probes: for tiny tasks its network is narrow, its windows are short, and
     it learns fast, from the first step on."""
     if isinstance(algorithm, GacrlPaperConfig):
         return Trial(algorithm, 1_500)

@@ -14,12 +14,12 @@ class UserError(Exception):
 
 
 def reason(error: OSError) -> str:
-    """The operating system's words for what went wrong, without numbers and tracebacks."""
+    """Return the operating system's words for what went wrong, without numbers and tracebacks."""
     return error.strerror or str(error)
 
 
 def full_memory(error: BaseException) -> str | None:
-    """The words of an error that is about a full memory; None for any other error."""
+    """Return the words of an error that is about a full memory; None for any other error."""
     if isinstance(error, MemoryError):
         return str(error).rstrip(" .") or "out of memory"
     found = _FULL.search(str(error)) if isinstance(error, RuntimeError) else None
@@ -27,7 +27,7 @@ def full_memory(error: BaseException) -> str | None:
 
 
 def missing_device(error: BaseException) -> str | None:
-    """The words of an error that is about a device that JAX cannot start; None for any other error."""
+    """Return the words of an error that is about a device that JAX cannot start; None for any other error."""
     found = _MISSING.search(str(error)) if isinstance(error, RuntimeError) else None
     return None if found is None else found[0].rstrip(" .")
 

@@ -11,16 +11,17 @@ from pathlib import Path
 
 from gacrl import reel
 from gacrl.errors import UserError
-from gacrl.evaluation.episodes import Episode, written_whole
+from gacrl.evaluation.episodes import Episode
 from gacrl.reel import Beside
 from gacrl.render import WORDS
+from gacrl.replacing import replaced
 from gacrl.tasks.task import Words
 
 _FPS = 10
 
 
 def require_format(path: Path) -> None:
-    """Raises UserError, with one sentence, for a name that ends in no format that can be written here."""
+    """Raise UserError, with one sentence, for a name that ends in no format that can be written here."""
     kind = path.suffix.lower()
     if kind not in (".png", ".gif", ".mp4"):
         what = f"cannot write {kind[1:].upper()}" if kind else "its name does not say what to write"
@@ -68,7 +69,7 @@ def _mp4(
     times = [max(1, round(pause * _FPS / 1000)) for pause in reel.durations(episodes, _FPS, beside)]
     frames = reel.drawn(episodes, size, title, words, 1, beside)
     first = next(frames)
-    with written_whole(path) as file, tempfile.TemporaryFile() as said:
+    with replaced(path) as file, tempfile.TemporaryFile() as said:
         command = [
             *(str(_ffmpeg()), "-loglevel", "error", "-y"),
             *(

@@ -44,14 +44,14 @@ class Pen:
         """One pixel of the layout."""
 
     def trail(self, points: Sequence[Sequence[float]], radius: float) -> None:
-        """Where an agent came from: the older, the fainter."""
+        """Draw where an agent came from: the older, the fainter."""
         for age, ((x0, y0), (x1, y1)) in enumerate(zip(points[-2::-1], points[:0:-1], strict=True)):
             if 0 < math.hypot(x1 - x0, y1 - y0) < _JUMP * radius:
                 strength = round(220 * (1 - age / TRAIL_STEPS))
                 self._draw.line((x0, y0, x1, y1), _see_through(_TRAIL, strength), self._width(3))
 
     def edge(self, sender: Point, receiver: Point, strength: int, arrow_at: float | None = None) -> None:
-        """A line between two who hear each other; an arrow, this far from its end, where only one does."""
+        """Draw a line between two who hear each other; an arrow, this far from its end, where only one does."""
         self._draw.line((*sender, *receiver), _see_through(RIM, strength), self._width(1.5))
         if arrow_at is not None:
             angle = math.atan2(receiver[1] - sender[1], receiver[0] - sender[0])
@@ -60,11 +60,11 @@ class Pen:
             self._draw.polygon([tip, *wings], RIM)
 
     def road(self, start: Sequence[float], end: Sequence[float]) -> None:
-        """A line of the ground, from where to where."""
+        """Draw a line of the ground, from where to where."""
         self._draw.line((*start, *end), BORDER, self._width(2))
 
     def landmark(self, point: Point, radius: float, covered: bool, colour: int = PLAIN) -> None:
-        """A cross in a dashed ring, or a green disc; one with a colour of its own is drawn in it."""
+        """Draw a cross in a dashed ring, or a green disc; one with a colour of its own is drawn in it."""
         ink = UNCOVERED if colour == PLAIN else SYMBOL_COLOURS[colour % len(SYMBOL_COLOURS)]
         if covered:
             self._circle(point, radius, fill=_see_through(COVERED, 90))
@@ -77,12 +77,12 @@ class Pen:
             self._draw.line(ends, ink, self._width(1.5 if colour == PLAIN else 3))
 
     def ring(self, point: Point, radius: float, covered: bool) -> None:
-        """What marks a covered landmark through the agent that stands on it."""
+        """Draw what marks a covered landmark through the agent that stands on it."""
         if covered:
             self._circle(point, radius, outline=COVERED, width=self._width(3))
 
     def disc(self, point: Point, radius: float, colour: int = PLAIN, alarm: bool = False) -> None:
-        """An agent; the rim has its own colour, or that of an alarm."""
+        """Draw an agent; the rim has its own colour, or that of an alarm."""
         own = RIM if colour == PLAIN else SYMBOL_COLOURS[colour % len(SYMBOL_COLOURS)]
         width = 1.5 if colour == PLAIN and not alarm else 3
         self._circle(point, radius, _see_through(_BODY, 200), _ALARM if alarm else own, self._width(width))

@@ -52,7 +52,7 @@ class TrainedRun:
         return self.trainer.evaluation_env
 
     def policy(self, member: int, explore: bool) -> Policy:
-        """The policy of one seed."""
+        """Return the policy of one seed."""
         return self.trainer.algorithm.policy(one_seed(self.learners, member), explore)
 
 
@@ -62,7 +62,7 @@ def open_run(
     warn: Callable[[str], None] = lambda sentence: None,
     intervention: Intervention | None = None,
 ) -> TrainedRun:
-    """The run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
+    """Open the run in a folder, or `FOLDER@k`: member k of it alone (counted from 0); or `pretrained:NAME`.
 
     `@best` behind it takes the parameters that scored best while training, instead of the newest.
 
@@ -156,7 +156,7 @@ def _require_member(path: Path, member: int, num_seeds: int) -> None:
 
 
 def parent(run: str | Path, warn: Callable[[str], None] = lambda sentence: None) -> Parent:
-    """A run to start another training from, by the names that `open_run` takes.
+    """Return a run to start another training from, by the names that `open_run` takes.
 
     Raises UserError where there is none.
     """
@@ -171,7 +171,7 @@ def parent(run: str | Path, warn: Callable[[str], None] = lambda sentence: None)
 
 
 def pretrained() -> dict[str, Path]:
-    """The policies that come with the package, by name."""
+    """Return the policies that come with the package, by name."""
     shipped = resources.files("gacrl") / "pretrained"
     folders = [Path(str(entry)) for entry in shipped.iterdir()] if shipped.is_dir() else []
     return {path.name: path for path in sorted(folders) if path.is_dir() and not path.name.startswith("_")}

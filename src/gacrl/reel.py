@@ -12,9 +12,10 @@ from jaxtyping import UInt8
 from PIL import GifImagePlugin, Image, ImageColor
 
 from gacrl.config.checks import typed, whole
-from gacrl.evaluation.episodes import Episode, written_whole
+from gacrl.evaluation.episodes import Episode
 from gacrl.pen import COVERED, INK, PAPER, SYMBOL_COLOURS, UNCOVERED
 from gacrl.render import WORDS, Photos, Picture, laid_out
+from gacrl.replacing import replaced
 from gacrl.tasks.task import Words
 
 _COLOURS = 96
@@ -54,7 +55,7 @@ def gif(
     """
     pixels = whole(size, "size")
     pauses = durations(episodes, fps, beside)
-    with written_whole(path) as file:
+    with replaced(path) as file:
         palette = _palette(drawn(episodes, pixels, title, words, -(-len(pauses) // _SAMPLES), beside))
         film = _Film(file, palette.getpalette() or [])
         for picture, pause in zip(drawn(episodes, pixels, title, words, 1, beside), pauses, strict=True):
@@ -84,7 +85,7 @@ def strip(
         rows += [np.hstack([np.asarray(picture.draw(t)) for t in times]) for picture in pictures]
     width = max(row.shape[1] for row in rows)
     white = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    with written_whole(path) as file:
+    with replaced(path) as file:
         Image.fromarray(np.vstack(white)).save(file, "PNG")
 
 
@@ -139,7 +140,7 @@ def durations(episodes: Sequence[Episode], fps: int | float, beside: Beside | No
 
 
 def num_frames(num_steps: int) -> int:
-    """How many frames a picture has of an episode of so many steps."""
+    """Return how many frames a picture has of an episode of so many steps."""
     return min(num_steps + 1, MOST_FRAMES)
 
 

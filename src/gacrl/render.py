@@ -36,7 +36,7 @@ WORDS = Words()
 
 
 def frame(episode: Episode, t: int, size: int = 480, title: str = "", words: Words = WORDS) -> Image.Image:
-    """The world before step t (after the last one: t = T), `size` pixels wide."""
+    """Draw the world before step t (after the last one: t = T), `size` pixels wide."""
     if not 0 <= t <= episode.num_steps:
         raise ValueError(f"the episode has the frames 0 to {episode.num_steps}, not {t}")
     return Picture(episode, size, title, "", words).draw(t)
@@ -79,7 +79,7 @@ class Photos:
         self._size = size, round(size * self._frames.shape[1] / self._frames.shape[2])
 
     def draw(self, t: int) -> Image.Image:
-        """The frame before step t; the last one from the end on."""
+        """Draw the frame before step t; the last one from the end on."""
         return Image.fromarray(self._frames[min(t, len(self._frames) - 1)]).resize(self._size)
 
 
@@ -131,7 +131,7 @@ class Picture:
             ground.text((right - inset, bottom - inset), "start area", UNCOVERED, small, "rb")
 
     def draw(self, t: int) -> Image.Image:
-        """The frame before step t; once the episode is over its last one."""
+        """Draw the frame before step t; once the episode is over its last one."""
         t = min(t, self.episode.num_steps)
         page = self._page.copy()
         page.paste(self._scene(t), (0, self._header))

@@ -137,8 +137,9 @@ def happened(decided: Carry, decision: Decision, after: TimeStep) -> Transition:
 
 
 def measured(after: TimeStep) -> dict[str, Array]:
-    """The measurements of a step, of one environment or of many; the mean reward of those who were there is added
-    where the task does not say it."""
+    """Return the measurements of a step, of one environment or of many; the mean reward of those who were there is
+    added where the task does not say it.
+    """
     if "reward_raw" in after.info:
         return after.info
     there = after.observation.agent_mask

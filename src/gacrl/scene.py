@@ -79,7 +79,7 @@ def compose(
     lines: Float[Array, "M 2 2"] | None = None,
     ground: Float[Array, "2 2"] | None = None,
 ) -> Scene:
-    """A scene of these parts; without a ground everything may start anywhere."""
+    """Make a scene of these parts; without a ground everything may start anywhere."""
     return Scene(
         agents=agents,
         marks=discs(jnp.zeros((0, 2)), 0.0) if marks is None else marks,

@@ -14,7 +14,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def version(package: str = "gacrl") -> str:
-    """Of an installed package."""
+    """Return the version of an installed package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:  # imported from a folder of sources that was never installed
@@ -22,7 +22,8 @@ def version(package: str = "gacrl") -> str:
 
 
 def versions() -> dict[str, str]:
-    """What produced a run: packages, Python, and the commit where the source is a checkout of our own repository.
+    """Return what produced a run: packages, Python, and the commit where the source is a checkout of our own
+    repository.
 
     As they are when this process first asks, at the start of a run: a commit made since did not train it. A commit
     ends in `-dirty` where the sources have changes that are not in it.
@@ -42,7 +43,8 @@ def _versions() -> dict[str, str]:
 
 
 def git_commit(package: Path) -> str | None:
-    """The commit of our own repository, whose `src` holds this package; None where another one surrounds it, or none.
+    """Return the commit of our own repository, whose `src` holds this package; None where another one surrounds it, or
+    none.
 
     With changes in `src` that are not committed it ends in `-dirty`.
 

@@ -11,10 +11,10 @@ import pytest
 from conftest import drawn
 
 from gacrl.algorithms import build as algorithms
-from gacrl.algorithms import gacrl, q_learning, teaching
+from gacrl.algorithms import gacrl, q_learning, q_loss, teaching
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import STRENGTHS, choices
-from gacrl.algorithms.q_learning import Network
+from gacrl.algorithms.q_learner import Network
 from gacrl.config import presets
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.config.run import TrainingConfig
@@ -81,7 +81,7 @@ def test_rewards_teach_the_teacher_and_the_teacher_the_agents():
         def term(name: str) -> Any:
             def of(network: Network) -> jax.Array:
                 keys = jax.random.split(jax.random.key(1), 1)
-                return q_learning.loss(q, network, learner, learner.rewards, batch, keys)[1][name]
+                return q_loss.loss(q, network, learner, learner.rewards, batch, keys)[1][name]
 
             return jax.grad(of)(network)
 

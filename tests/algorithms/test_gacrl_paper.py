@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gacrl.algorithms import gacrl_paper, replay
+from gacrl.algorithms import gacrl_paper, gacrl_paper_networks, replay
 from gacrl.algorithms.gacrl_paper_exploration import Coverage
 from gacrl.config import presets
 from gacrl.config.algorithms import GacrlPaperConfig
@@ -275,7 +275,7 @@ def test_preset_is_table_one():
 def test_others_stand_in_ascending_order():
     """Entry [symbol, receiver, sender] reads receiver, sender and symbol off as digits."""
     received = jnp.asarray(np.fromfunction(lambda v, i, j: 100 * i + 10 * j + v, (2, 4, 4)))
-    side_by_side = gacrl_paper.others_side_by_side(received)
+    side_by_side = gacrl_paper_networks.others_side_by_side(received)
     np.testing.assert_array_equal(
         side_by_side.T,
         [
@@ -285,7 +285,7 @@ def test_others_stand_in_ascending_order():
             [300, 301, 310, 311, 320, 321],
         ],
     )
-    assert gacrl_paper.others_side_by_side(jnp.zeros((2, 1, 1))).shape == (0, 1)
+    assert gacrl_paper_networks.others_side_by_side(jnp.zeros((2, 1, 1))).shape == (0, 1)
 
 
 # The loss.

@@ -13,9 +13,10 @@ from conftest import drawn_learner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gacrl.algorithms import q_learning, replay
+from gacrl.algorithms import objectives, q_learning, replay
 from gacrl.algorithms.iql import independent
-from gacrl.algorithms.q_learning import Network, Parts, epsilon_greedy
+from gacrl.algorithms.q_learner import Network, Parts
+from gacrl.algorithms.q_learning import epsilon_greedy
 from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import IqlConfig, VdnConfig
 from gacrl.config.run import TrainingConfig
@@ -207,7 +208,7 @@ def test_the_loss_is_that_of_the_text(name: str):
     given = hand_made(steps, case)
     after, metrics = update(learner, given, jax.random.key(0))
     errors = expected_errors(case, given, 1.3, -0.7)
-    assert np.abs(errors).max() < q_learning.HUBER_DELTA
+    assert np.abs(errors).max() < objectives.HUBER_DELTA
     np.testing.assert_allclose(metrics["loss_td"], 0.5 * np.square(errors).mean(), rtol=1e-5)
 
     if case.learned == case.n_step == 1:

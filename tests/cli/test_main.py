@@ -280,7 +280,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_none_is_refused(
 
 
 def test_a_device_without_memory_left_is_told(refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(cli._COMMANDS, "presets", lambda words: jnp.zeros(2**46))
+    monkeypatch.setitem(cli.COMMANDS, "presets", lambda words: jnp.zeros(2**46))
     said = refused("presets")
     assert "memory is full" in said
     assert "281474976710656 bytes): take fewer seeds" in said

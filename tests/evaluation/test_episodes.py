@@ -15,9 +15,10 @@ import pytest
 from gacrl.envs.environment import Environment, TimeStep, observe
 from gacrl.envs.probes import Probe
 from gacrl.evaluation import references
-from gacrl.evaluation.episodes import Episode, Look, record_many, written_whole
+from gacrl.evaluation.episodes import Episode, Look, record_many
 from gacrl.evaluation.evaluate import evaluate
 from gacrl.networks.graph import proximity_adjacency
+from gacrl.replacing import replaced
 from gacrl.scene import PLAIN, Discs, Scene
 from gacrl.tasks.spread.environment import Spread, unpack_state
 from gacrl.tasks.spread.scene import scene
@@ -349,7 +350,7 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
         small_episode().save(tmp_path / "no folder" / "episode.npz")
     path = tmp_path / "episode.npz"
     path.write_text("before")
-    with pytest.raises(KeyboardInterrupt), written_whole(path) as file:
+    with pytest.raises(KeyboardInterrupt), replaced(path) as file:
         file.write(b"half")
         raise KeyboardInterrupt
     assert path.read_text() == "before"

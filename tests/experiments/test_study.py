@@ -11,7 +11,8 @@ from conftest import TinyRun
 from gacrl.config import presets
 from gacrl.config.run import RunConfig
 from gacrl.experiments.paper.evidence import read_series
-from gacrl.experiments.study import Planned, Watch, train_missing, why_diverged
+from gacrl.experiments.results import why_diverged
+from gacrl.experiments.study import Planned, Watch, train_missing
 from gacrl.tasks.spread.settings import METRICS
 from gacrl.training import session
 from gacrl.training.divergence import Diverged

@@ -17,8 +17,8 @@ import pytest
 from conftest import drawn_learner, soaked
 
 from gacrl import rollout
+from gacrl.algorithms import actions, gacrl_paper, q_learning, q_loss
 from gacrl.algorithms import build as algorithms
-from gacrl.algorithms import gacrl_paper, q_learning
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.contract import Algorithm
 from gacrl.cli.main import main
@@ -186,10 +186,10 @@ def test_the_replay_of_q_learning_holds_what_arrived_and_windows_hear_it(name: s
     def values(stored: Any) -> Any:
         first = jax.tree.map(lambda leaf: leaf[0], stored.memory)
         temperature = q.explorer.level(learner.exploration, learner.env_steps).temperature
-        output, _ = q_learning.along(learner.network.agent, stored.transition, first, None, temperature)
+        output, _ = q_loss.along(learner.network.agent, stored.transition, first, None, temperature)
 
         def value(output: Any, seen: Any) -> Any:
-            best = q_learning.greedy(output.head, q.actions.mask(seen.action_mask))
+            best = actions.greedy(output.head, q.actions.mask(seen.action_mask))
             return q.parts.team_value(learner.network, output, best, seen).mean()
 
         return jax.vmap(jax.vmap(value))(output, stored.transition.observation)

@@ -170,7 +170,9 @@ def _spread_state(worlds: Sequence[Any]) -> SpreadState:
 
 
 def navigation_state(worlds: Sequence[Any]) -> NavigationState:
-    """Where the worlds stand, and who seeks which landmark; the clock and what was said read as in the beginning."""
+    """Return where the worlds stand, and who seeks which landmark; the clock and what was said read as in the
+    beginning.
+    """
     positions, velocities, landmarks = _places(worlds)
     copies, num_agents = positions.shape[:2]
     order = jnp.arange(landmarks.shape[1], dtype=jnp.int32)

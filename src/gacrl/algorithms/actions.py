@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.config.checks import require
 from gacrl.envs.environment import Environment
@@ -31,7 +31,10 @@ class ActionSet(NamedTuple):
 
 
 def choices(env: Environment) -> ActionSet:
-    """What the agents of this task choose among. Raises ConfigError for continuous actions that are no pushes."""
+    """Return what the agents of this task choose among.
+
+    Raises ConfigError for continuous actions that are no pushes.
+    """
     if not env.continuous_actions:
         return ActionSet(env.num_actions, lambda choice: choice, env.turn_action, lambda mask: mask)
 
@@ -52,3 +55,8 @@ def choices(env: Environment) -> ActionSet:
         turn=lambda choice, symmetry: jnp.asarray(becomes)[symmetry][choice],
         mask=lambda mask: jnp.ones((*mask.shape[:-1], len(table)), bool),
     )
+
+
+def greedy(values: Float[Array, "N A"], action_mask: Bool[Array, "N A"]) -> Int[Array, " N"]:
+    """Return the best available action of each agent."""
+    return jnp.where(action_mask, values, -jnp.inf).argmax(-1)

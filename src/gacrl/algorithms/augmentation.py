@@ -17,7 +17,7 @@ from gacrl.types import Memory, Observation, PRNGKey, Transition
 
 
 def turn_experience(env: Environment, choices: ActionSet, steps: Transition, key: PRNGKey) -> Transition:
-    """Each environment's steps [T, E, …] in a world turned by a random symmetry; rewards stay as they are.
+    """Return each environment's steps [T, E, …] in a world turned by a random symmetry; rewards stay as they are.
 
     The decisions' actions are what was drawn of the choices. A task without symmetries gives its steps back.
     """
@@ -44,7 +44,7 @@ def play(
     memory: Memory,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[AgentOutput, Memory]:
-    """What the network puts out when nothing is drawn.
+    """Return what the network puts out when nothing is drawn.
 
     `symmetric` (and without a memory): its head [N, A] is the mean over the turned worlds, turned back, so that
     when the world turns the actions do. Every turned world has a conversation of its own: all that is computed and
@@ -63,7 +63,7 @@ def play(
 
 
 def require_no_memory_in_symmetric_play(config: LearningConfig, env: Environment, memory: Memory) -> None:
-    """Raises ConfigError where a network that remembers is to play by the mean over turned worlds."""
+    """Raise ConfigError where a network that remembers is to play by the mean over turned worlds."""
     require(
         not (config.symmetric_play and env.num_symmetries > 1 and jax.tree.leaves(memory)),
         "algorithm.symmetric_play needs a network without memory: leave it off with a recurrent network, or with "

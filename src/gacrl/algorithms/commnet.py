@@ -13,5 +13,5 @@ from gacrl.envs.environment import Environment
 def make(
     config: CommnetConfig, env: Environment, training: TrainingConfig, progress: str | None = None
 ) -> Algorithm:
-    """PPO with a critic for each agent, through messages."""
+    """Make PPO with a critic for each agent, through messages."""
     return ppo.make(config, env, training, progress, view="local")

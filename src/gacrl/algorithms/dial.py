@@ -6,7 +6,7 @@ window of several steps is learned from, since what is said at a step is worth s
 
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.q_learning import Parts
+from gacrl.algorithms.q_learner import Parts
 from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import DialConfig
 from gacrl.config.run import TrainingConfig

@@ -61,17 +61,17 @@ def categorical(actions: ActionSet) -> Distribution:
 
 
 def log_policy(logits: Float[Array, "*b A"], action_mask: Bool[Array, "*b A"]) -> Float[Array, "*b A"]:
-    """log π; −∞ for actions that are not available."""
+    """Return log π; −∞ for actions that are not available."""
     return jax.nn.log_softmax(jnp.where(action_mask, logits, -jnp.inf))
 
 
 def explores(epsilon: Float[Array, "..."] | float) -> bool:
-    """Whether there may be random actions: False for a plain 0, which costs nothing."""
+    """Return whether there may be random actions: False for a plain 0, which costs nothing."""
     return not (isinstance(epsilon, float) and epsilon == 0.0)
 
 
 def mixed(log_probs: Float[Array, "*b A"], epsilon: Float[Array, "*#b"] | float | None) -> Float[Array, "*b A"]:
-    """What is acted by: (1 − ε) π + ε · uniform over the available actions; π itself for no ε."""
+    """Return what is acted by: (1 − ε) π + ε · uniform over the available actions; π itself for no ε."""
     if epsilon is None or not explores(epsilon):
         return log_probs
     available = log_probs > -jnp.inf
@@ -83,7 +83,7 @@ def mixed(log_probs: Float[Array, "*b A"], epsilon: Float[Array, "*#b"] | float 
 
 
 def entropy(log_probs: Float[Array, "*b A"]) -> Float[Array, "*b"]:
-    """Of categorical distributions, in nats; actions with probability 0 count nothing."""
+    """Return the entropy of categorical distributions, in nats; actions with probability 0 count nothing."""
     probs = jnp.exp(log_probs)
     return -(probs * jnp.where(probs > 0, log_probs, 0.0)).sum(-1)
 
@@ -127,7 +127,7 @@ def gaussian(env: Environment) -> Distribution:
 
 
 def normal_log_prob(pi: Normal, drawn: Float[Array, "*b A"]) -> Float[Array, "*b"]:
-    """log N(drawn; mean, std), summed over the numbers of an action."""
+    """Return log N(drawn; mean, std), summed over the numbers of an action."""
     scaled = (drawn - pi.mean) * jnp.exp(-pi.log_std)
     each = -0.5 * jnp.square(scaled) - pi.log_std - 0.5 * math.log(2 * math.pi)
     return jnp.where(pi.there, each, 0.0).sum(-1)

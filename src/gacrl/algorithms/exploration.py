@@ -61,7 +61,7 @@ def in_time(level: Callable[[Int[Array, ""]], Level], moves: bool = True) -> Exp
 
 
 def none(settings: LearningConfig, planned_steps: int, progress: str | None) -> Exploration:
-    """No random actions: a policy that is sampled explores by itself. Messages stay at the start's temperature."""
+    """Take no random actions: a policy that is sampled explores by itself. Messages stay at the start's temperature."""
     return in_time(lambda env_steps: Level(0.0, settings.temperature), moves=False)
 
 

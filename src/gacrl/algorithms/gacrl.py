@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.q_learning import Network, Parts, message_loss
+from gacrl.algorithms.q_learner import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
 from gacrl.algorithms.vdn import summed
 from gacrl.config.algorithms import GacrlConfig
@@ -50,7 +50,7 @@ def central(
 def make(
     config: GacrlConfig, env: Environment, training: TrainingConfig, progress: str | None = None
 ) -> Algorithm:
-    """The learner for this task's shapes. progress: the task's measure that exploration follows."""
+    """Make the learner for this task's shapes. progress: the task's measure that exploration follows."""
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
     width = settings.width

@@ -1,17 +1,14 @@
 """GACRL exactly as the paper prints it: equations (2) to (20), read as docs/algorithm.md says.
 
-Top to bottom: the networks (2)–(12), how agents act (9)–(16), the loss (17)–(20), one update.
-Equation (1) is in `tasks.spread.shaping`, the encoder (2)–(3) in `networks.encoder`, the graph (4) and (7) in
-`networks.graph`, Gumbel-Softmax (9) in `networks.messages`, adaptive exploration (13)–(16) in
-`gacrl_paper_exploration`.
+Top to bottom: how agents act (9)–(16), the loss (17)–(20), one update. The networks (2)–(12) are in
+`gacrl_paper_networks`, adaptive exploration (13)–(16) in `gacrl_paper_exploration`, equation (1) in
+`tasks.spread.shaping`.
 """
 
 from dataclasses import dataclass
 from functools import partial
-from math import prod
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -27,176 +24,29 @@ from gacrl.algorithms.gacrl_paper_exploration import (
     linear_decay,
     no_coverage,
 )
+from gacrl.algorithms.gacrl_paper_networks import (
+    ROUNDS,
+    Critic,
+    MessageModel,
+    Network,
+    Noise,
+    PolicyNetwork,
+    draw_noise,
+    forward,
+)
 from gacrl.config.algorithms import GacrlPaperConfig
 from gacrl.config.checks import require
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.messages import interventions
-from gacrl.networks.arrives import arriving
-from gacrl.networks.encoder import Encoder, kl_divergence, sample_latent
-from gacrl.networks.graph import heard_adjacency, neighbour_sum
-from gacrl.networks.layers import Linear, redrawn
-from gacrl.networks.messages import gumbel_softmax, most_likely_symbol, normal_and_gumbel
+from gacrl.networks.encoder import Encoder, kl_divergence
+from gacrl.networks.graph import heard_adjacency
+from gacrl.networks.layers import redrawn
 from gacrl.types import Arrives, Decision, Memory, Metrics, Observation, Policy, PRNGKey, Rollout, Transition
-
-ROUNDS = 2
-"""Agents hear each other twice in a step: the sum of (7), and the symbols of (10)."""
-
-
-class MessageModel(eqx.Module):
-    """Equations (5) to (9) without the sampling: one round of message passing over the graph."""
-
-    w1: Linear
-    w2: Linear
-    w3: Linear
-    w4: Linear
-
-    def __init__(self, latent_size: int, hidden_size: int, vocabulary: int, key: PRNGKey):
-        k1, k2, k3, k4 = jax.random.split(key, 4)
-        self.w1 = Linear(latent_size, hidden_size, k1)
-        self.w2 = Linear(hidden_size, vocabulary, k2)
-        self.w3 = Linear(hidden_size + vocabulary, hidden_size, k3)
-        self.w4 = Linear(hidden_size, vocabulary, k4)
-
-    def __call__(
-        self, latent: Float[Array, "Z N"], adjacency: Bool[Array, "N N"], arrives: Arrives
-    ) -> tuple[Float[Array, "V N"], Float[Array, "V N"]]:
-        """Return what each agent sends along the graph, and the logits of its outgoing symbol."""
-        h1 = jax.nn.relu(self.w1(latent, axis=0))  # (5)
-        m = self.w2(h1, axis=0)  # (6)
-        m_sum = neighbour_sum(arriving(m.T, arrives, 0, ROUNDS).T, adjacency)  # (7)
-        h2 = jax.nn.relu(self.w3(jnp.concatenate([h1, m_sum]), axis=0))  # (8)
-        return m, self.w4(h2, axis=0)
-
-
-class PolicyNetwork(eqx.Module):
-    """Equation (11), with the hidden layer that W6 ∈ R^{5×32} needs: input-64-32-5."""
-
-    w5: Linear
-    hidden: Linear
-    w6: Linear
-
-    def __init__(self, in_size: int, hidden_sizes: tuple[int, int], num_actions: int, key: PRNGKey):
-        k5, k_hidden, k6 = jax.random.split(key, 3)
-        self.w5 = Linear(in_size, hidden_sizes[0], k5)
-        self.hidden = Linear(hidden_sizes[0], hidden_sizes[1], k_hidden)
-        self.w6 = Linear(hidden_sizes[1], num_actions, k6)
-
-    def __call__(self, x: Float[Array, "X N"]) -> Float[Array, "A N"]:
-        """Returns the logits of the actions."""
-        hidden = jax.nn.relu(self.hidden(jax.nn.relu(self.w5(x, axis=0)), axis=0))
-        return self.w6(hidden, axis=0)
-
-
-class Critic(eqx.Module):
-    """Equation (12), with the hidden layer that W8 ∈ R^{1×64} needs: input-128-64-1."""
-
-    w7: Linear
-    hidden: Linear
-    w8: Linear
-
-    def __init__(self, in_size: int, hidden_sizes: tuple[int, int], key: PRNGKey):
-        k7, k_hidden, k8 = jax.random.split(key, 3)
-        self.w7 = Linear(in_size, hidden_sizes[0], k7)
-        self.hidden = Linear(hidden_sizes[0], hidden_sizes[1], k_hidden)
-        self.w8 = Linear(hidden_sizes[1], 1, k8)
-
-    def __call__(self, features: Float[Array, "N O"]) -> Float[Array, ""]:
-        """V(s) of the global state s = [o_1, …, o_N]."""
-        s = features.reshape(-1)
-        hidden = jax.nn.relu(self.hidden(jax.nn.relu(self.w7(s, axis=0)), axis=0))
-        return self.w8(hidden, axis=0)[0]
-
-
-class Network(eqx.Module):
-    encoder: Encoder
-    message_model: MessageModel
-    policy: PolicyNetwork
-    critic: Critic
-
-
-class Noise(NamedTuple):
-    """What a forward pass draws: ε of (3), and the Gumbel noise of (9)."""
-
-    latent: Float[Array, "Z N *b"]
-    gumbel: Float[Array, "V N *b"]
-
-
-def draw_noise(
-    key: PRNGKey, num_agents: int, num_actions: int, config: GacrlPaperConfig, *batch: int
-) -> tuple[Noise, Float[Array, "N A"]]:
-    """The noise of a forward pass, and Gumbel noise to choose the actions with (none for 0 actions).
-
-    One draw serves all: a call of the generator costs more than the few numbers in it.
-    """
-    num_latent = config.latent_size * num_agents * prod(batch)
-    num_gumbel = config.vocabulary * num_agents * prod(batch)
-    num_choice = num_agents * num_actions
-    normal, gumbel = normal_and_gumbel(key, num_latent, num_gumbel + num_choice)
-    noise = Noise(
-        normal.reshape(config.latent_size, num_agents, *batch),
-        gumbel[:num_gumbel].reshape(config.vocabulary, num_agents, *batch),
-    )
-    return noise, gumbel[num_gumbel:].reshape(num_agents, num_actions)
-
-
-class Forward(NamedTuple):
-    """What one forward pass over one environment's agents computes, a column for each agent."""
-
-    logits: Float[Array, "A N *b"]
-    messages: Float[Array, "R V N *b"]
-    """What is sent by (6), and the symbols of (9)."""
-    mean: Float[Array, "Z N *b"]
-    log_variance: Float[Array, "Z N *b"]
-
-
-def forward(
-    network: Network,
-    features: Float[Array, "N O"],
-    adjacency: Bool[Array, "N N"],
-    temperature: Float[Array, ""],
-    noise: Noise | None,
-    straight_through: bool = False,
-    arrives: Arrives = Arrives(),  # noqa: B008 it is a constant
-) -> Forward:
-    """Compute action logits from observations, equations (2) to (11), for the N agents of one environment.
-
-    Agents stand in columns, as the paper's W z_i + b has them; `Linear` says why that is also fast.
-    Without noise: the mean latent and each agent's most likely symbol (evaluation).
-    """
-    o = features.T
-    mean, log_variance = network.encoder(o, axis=0)  # (2)
-    z = mean if noise is None else sample_latent(mean, log_variance, noise.latent)  # (3)
-    m, symbol_logits = network.message_model(z, adjacency, arrives)  # (5)-(8)
-    if noise is None:
-        symbol = most_likely_symbol(symbol_logits, axis=0)
-    else:
-        symbol = gumbel_softmax(symbol_logits, noise.gumbel, temperature, straight_through, axis=0)  # (9)
-    heard = arriving(symbol.T, arrives, 1, ROUNDS).T
-    received = jnp.broadcast_to(heard[:, None, :], (heard.shape[0], *adjacency.shape))
-    if arrives.kept is not None:
-        received = received * arrives.kept[None]
-    x = jnp.concatenate([o, others_side_by_side(received), z])  # (10)
-    return Forward(network.policy(x), jnp.stack([m, symbol]), mean, log_variance)  # (11)
-
-
-def others_side_by_side(received: Float[Array, "V N N"]) -> Float[Array, "(N-1)*V N"]:
-    """The messages part of equation (10): concat([m_j | j ≠ i]), j ascending, whoever is near.
-
-    received: entry [:, i, j] is j's message as it reaches i.
-    """
-    num_agents = received.shape[1]
-    if num_agents == 1:
-        return jnp.zeros((0, 1))
-    # Slot k holds agent k for those after it and agent k + 1 for the others.
-    slots = [
-        jnp.stack([received[:, i, k + (k >= i)] for i in range(num_agents)], axis=1) for k in range(num_agents - 1)
-    ]
-    return jnp.concatenate(slots)
 
 
 def behaviour_probabilities(logits: Float[Array, "*b A"], epsilon: Float[Array, ""]) -> Float[Array, "*b A"]:
-    """What the agents act by: with probability ε uniformly, else by the policy of (11).
+    """Return what the agents act by: with probability ε uniformly, else by the policy of (11).
 
     Actions with a logit of −∞ are not available: neither part of the mixture takes them.
     """
@@ -243,6 +93,8 @@ class Hyper(NamedTuple):
 
 
 class LearnerState(NamedTuple):
+    """What the paper's GACRL carries from update to update."""
+
     network: Network
     optimizer: optax.OptState
     replay: ring.Replay[Float[Array, "capacity W"]]
@@ -252,7 +104,7 @@ class LearnerState(NamedTuple):
 
 
 def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) -> Float[Array, "N *b"]:
-    """log π of the actions taken, by equation (11) alone: ε is not part of it."""
+    """Return log π of the actions taken, by equation (11) alone: ε is not part of it."""
     taken = jax.nn.one_hot(action, logits.shape[0], axis=0)
     return (jax.nn.log_softmax(logits, axis=0) * taken).sum(0)
 
@@ -260,7 +112,7 @@ def log_probability(logits: Float[Array, "A N *b"], action: Int[Array, "N *b"]) 
 def policy_loss(
     log_probability: Float[Array, "N rows"], reward: Float[Array, " rows"], batch_size: int
 ) -> Float[Array, ""]:
-    """Equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
+    """Compute equation (18): −log π · r, averaged over agents; the mean over the replayed rows plus the current row.
 
     The weight is the immediate reward, as printed: no return, no baseline, no importance ratio.
     """
@@ -269,14 +121,14 @@ def policy_loss(
 
 
 def critic_loss(value: Float[Array, " B"], reward: Float[Array, " B"]) -> Float[Array, ""]:
-    """Equation (19): the critic regresses the immediate reward."""
+    """Compute equation (19): the critic regresses the immediate reward."""
     return jnp.square(value - reward).mean()
 
 
 def kl_loss(
     mean: Float[Array, "Z N B"], log_variance: Float[Array, "Z N B"], mean_over_latent: bool = False
 ) -> Float[Array, ""]:
-    """Equation (20): without the ½, summed over the latent dimensions, averaged over agents and batch."""
+    """Compute equation (20): without the ½, summed over the latent dimensions, averaged over agents and batch."""
     loss = 2.0 * kl_divergence(mean, log_variance, axis=0).mean()
     return loss / mean.shape[0] if mean_over_latent else loss
 
@@ -289,7 +141,7 @@ def loss(
     noise: Noise,
     config: GacrlPaperConfig,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Equation (17) on B replayed rows and, as the last row, the current step.
+    """Compute equation (17) on B replayed rows and, as the last row, the current step.
 
     Latents, messages and log-probabilities are recomputed with the current weights and temperature.
     Returns the loss and its three parts.

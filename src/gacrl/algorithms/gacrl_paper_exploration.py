@@ -23,7 +23,7 @@ def linear_decay(
     episode: Int[Array, ""],
     num_episodes: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Equations (15) and (16): max(end, start − episode × (start − end) / num_episodes), for start ≥ end."""
+    """Compute equations (15) and (16): max(end, start − episode × (start − end) / num_episodes), for start ≥ end."""
     return jnp.maximum(end, start - episode * ((start - end) / num_episodes))
 
 
@@ -33,7 +33,7 @@ def adaptive_level(
     num_episodes: Float[Array, ""] | float,
     coverage: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Equations (13) and (14): base(episode) + bonus × (1 − coverage)."""
+    """Compute equations (13) and (14): base(episode) + bonus × (1 − coverage)."""
     base = linear_decay(schedule.start, schedule.end, episode, num_episodes)
     return base + schedule.bonus * (1.0 - coverage)
 

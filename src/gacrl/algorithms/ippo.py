@@ -8,5 +8,5 @@ from gacrl.envs.environment import Environment
 
 
 def make(config: IppoConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
-    """PPO with a critic for each agent."""
+    """Make PPO with a critic for each agent."""
     return ppo.make(config, env, training, progress, view="local")

@@ -4,7 +4,7 @@ from jaxtyping import Array, Float, Int
 
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.q_learning import Network, Parts
+from gacrl.algorithms.q_learner import Network, Parts
 from gacrl.algorithms.shared import taken
 from gacrl.config.algorithms import IqlConfig
 from gacrl.config.run import TrainingConfig

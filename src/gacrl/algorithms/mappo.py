@@ -10,5 +10,5 @@ from gacrl.envs.environment import Environment
 def make(
     config: MappoConfig, env: Environment, training: TrainingConfig, progress: str | None = None
 ) -> Algorithm:
-    """PPO with a central critic."""
+    """Make PPO with a central critic."""
     return ppo.make(config, env, training, progress, view="central")

@@ -14,7 +14,7 @@ def clipped_surrogate(
     advantage: Float[Array, "*b"],
     clip_eps: Float[Array, ""] | float,
 ) -> Float[Array, "*b"]:
-    """PPO's clipped policy objective, to be minimised (Schulman et al. 2017, eq. 7); elementwise."""
+    """Return PPO's clipped policy objective, to be minimised (Schulman et al. 2017, eq. 7); elementwise."""
     ratio = jnp.exp(log_prob - behaviour_log_prob)
     clipped = jnp.clip(ratio, 1.0 - clip_eps, 1.0 + clip_eps)
     return -jnp.minimum(ratio * advantage, clipped * advantage)
@@ -39,17 +39,21 @@ class ValueNorm(NamedTuple):
 
     @property
     def mean(self) -> Float[Array, ""]:
+        """The mean of the returns seen."""
         return self.first / jnp.maximum(self.weight, 1e-5)
 
     @property
     def sd(self) -> Float[Array, ""]:
+        """Their standard deviation, at least .01; 1 before any was seen."""
         variance = self.second / jnp.maximum(self.weight, 1e-5) - jnp.square(self.mean)
         return jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
 
     def normalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        """Return values in standard deviations around the mean."""
         return (values - self.mean) / self.sd
 
     def denormalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+        """Return normalised values in the unit of the returns."""
         return values * self.sd + self.mean
 
 

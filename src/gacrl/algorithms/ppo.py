@@ -41,6 +41,8 @@ from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey,
 
 
 class Network(eqx.Module):
+    """What is learned; actor and critic share nothing."""
+
     actor: AgentNetwork
     critic: Critic
 
@@ -69,6 +71,8 @@ class Hyper(NamedTuple):
 
 
 class LearnerState(NamedTuple):
+    """What PPO carries from update to update."""
+
     network: Network
     optimizer: optax.OptState
     norm: ValueNorm
@@ -115,7 +119,7 @@ class Setup:
 def make(
     config: PpoConfig, env: Environment, training: TrainingConfig, progress: str | None, view: View
 ) -> Algorithm:
-    """PPO for this task's shapes, with the critic's view. progress: the measure that exploration may follow.
+    """Make PPO for this task's shapes, with the critic's view. progress: the measure that exploration may follow.
 
     Raises ConfigError for settings that continuous actions do not go with.
     """
@@ -183,7 +187,7 @@ def networks(p: Setup, key: PRNGKey) -> Network:
 
 
 def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
-    """A learner that has learned nothing."""
+    """Make a learner that has learned nothing."""
     network = redrawn(networks(p, key), key)
     return LearnerState(
         network=network,
@@ -196,7 +200,7 @@ def init(p: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
 
 
 def initial_memory(p: Setup, num_agents: int) -> Memory:
-    """The policy's memory at an episode's start; () where there is none."""
+    """Return the policy's memory at an episode's start; () where there is none."""
     network = eqx.filter_eval_shape(partial(networks, p), jax.random.key(0))
     memories = network.actor.initial_memory(num_agents), network.critic.initial_memory(num_agents)
     memory = PpoMemory(*memories, p.explorer.initial_memory)
@@ -204,12 +208,12 @@ def initial_memory(p: Setup, num_agents: int) -> Memory:
 
 
 def split_memory(memory: Memory) -> PpoMemory:
-    """A policy's memory as actor's and critic's."""
+    """Return a policy's memory as actor's and critic's."""
     return memory if isinstance(memory, PpoMemory) else PpoMemory((), ())
 
 
 def level_of(p: Setup, learner: LearnerState) -> Level:
-    """How much is explored until the next update."""
+    """Return how much is explored until the next update."""
     env_steps = learner.updates * p.steps_per_update if p.explorer.moves else learner.updates
     return p.explorer.level(learner.exploration, env_steps)
 
@@ -325,14 +329,14 @@ def loss(
 
 
 def normalised(advantage: Float[Array, "T E N"], real: Bool[Array, "T E N"]) -> Float[Array, "T E N"]:
-    """In standard deviations of the rollout, around its mean."""
+    """Return advantages in standard deviations of the rollout, around its mean."""
     centre = mean_real(advantage, real)
     spread = jnp.sqrt(mean_real(jnp.square(advantage - centre), real))
     return (advantage - centre) / (spread + 1e-8)
 
 
 def gradients_on(p: Setup, whole: tuple[Any, ...], rows: Int[Array, " rows"]) -> tuple[Network, Metrics]:
-    """Of these rows' part of the loss; count: the real agents of the whole minibatch."""
+    """Differentiate these rows' part of the loss; count: the real agents of the whole minibatch."""
     network, sample, memory, hyper, ent_coef, count, temperature = whole
     part = jax.tree.map(lambda leaf: leaf[:, rows], sample)
     remembered = jax.tree.map(lambda leaf: leaf[rows], memory)
@@ -381,7 +385,7 @@ def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> t
 
 
 def chosen(p: Setup, steps: Transition) -> Transition:
-    """The steps with choices for actions, and with the masks of choices."""
+    """Return the steps with choices for actions, and with the masks of choices."""
     available = p.actions.mask(steps.observation.action_mask)
     return steps._replace(
         observation=steps.observation._replace(action_mask=available),
@@ -390,7 +394,7 @@ def chosen(p: Setup, steps: Transition) -> Transition:
 
 
 def sample_of(steps: Transition, advantage: Float[Array, "T E N"], target: Float[Array, "T E N"]) -> Sample:
-    """What is learned from: a rollout's choices, and what came of them."""
+    """Return what is learned from: a rollout's choices, and what came of them."""
     extras, first = steps.decision.extras, steps.first
     if steps.left is not None:
         first = jax.vmap(beginnings, 1, 1)(steps.first, steps.left)

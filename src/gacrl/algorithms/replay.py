@@ -32,7 +32,7 @@ class Replay(eqx.Module, Generic[Item]):
 
 
 def empty(example: Item, capacity: int) -> Replay[Item]:
-    """A ring for items shaped like the example."""
+    """Make a ring for items shaped like the example."""
     return Replay(
         jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example),
         jnp.zeros((), jnp.int32),
@@ -55,7 +55,7 @@ def add_block(replay: Replay[Item], block: Item) -> Replay[Item]:
 
 
 def newest(replay: Replay[Item]) -> Int[Array, ""]:
-    """The row of the item that was added last."""
+    """Return the row of the item that was added last."""
     return (replay.added - 1) % replay.capacity
 
 
@@ -69,7 +69,7 @@ def sample_rows(replay: Replay[Item], key: PRNGKey, batch_size: int) -> Int[Arra
 
 
 def sample_windows(replay: Replay[Item], key: PRNGKey, batch_size: int, length: int) -> Int[Array, "W B"]:
-    """Rows of uniform stretches of `length` items that were added one after the other; oldest first."""
+    """Draw rows of uniform stretches of `length` items that were added one after the other; oldest first."""
     starts = jnp.maximum(replay.size - length + 1, 1).astype(jnp.uint32)
     first = (jax.random.bits(key, (batch_size,), jnp.uint32) % starts).astype(jnp.int32)
     oldest = jnp.where(replay.added > replay.capacity, replay.added % replay.capacity, 0)
@@ -77,12 +77,12 @@ def sample_windows(replay: Replay[Item], key: PRNGKey, batch_size: int, length: 
 
 
 def take(replay: Replay[Item], rows: Int[Array, " B"]) -> Item:
-    """The items in these rows."""
+    """Return the items in these rows."""
     return jax.tree.map(lambda ring: ring.at[rows].get(mode="promise_in_bounds"), replay.items)
 
 
 def pack(item: object) -> Float[Array, " W"]:
-    """An item as one vector of numbers.
+    """Return an item as one vector of numbers.
 
     Of rings with small items XLA makes whole copies where it reads what it has just written.
     """
@@ -90,7 +90,9 @@ def pack(item: object) -> Float[Array, " W"]:
 
 
 def packing(example: Callable[[], Item]) -> tuple[int, Callable[[Float[Array, " W"]], Item]]:
-    """The length of an item as a vector, and the inverse of `pack`; nothing is computed, only shapes are looked at."""
+    """Return the length of an item as a vector, and the inverse of `pack`; nothing is computed, only shapes are looked
+    at.
+    """
     inverses: list[Callable[[Float[Array, " W"]], Item]] = []
 
     def packed() -> Float[Array, " W"]:

@@ -15,7 +15,8 @@ def next_values(
     shortest: int,
     anew: Callable[[Int[Array, " K"]], Float[Array, "K *b"]],
 ) -> Float[Array, "T *b"]:
-    """The value of what followed each of T steps of one environment, from the value of each step's own observation.
+    """Return the value of what followed each of T steps of one environment, from the value of each step's own
+    observation.
 
     What followed is the next step's, and known, except where an episode was truncated, after which that is a new
     episode's, and at the end: only there `anew` computes it, given the steps. Room is made for as many truncations as
@@ -76,7 +77,7 @@ def n_step_returns(
 
 
 def n_step_window(done: Bool[Array, "T *b"], n: int) -> tuple[Float[Array, "n T *b"], Int[Array, "T *b"]]:
-    """Which of the n steps from each t on belong to its return (1 or 0), and the index of the last that does."""
+    """Return which of the n steps from each t on belong to its return (1 or 0), and the index of the last that does."""
     length = done.shape[0]
     time = jnp.broadcast_to(jnp.arange(length).reshape(-1, *[1] * (done.ndim - 1)), done.shape)
     alive, last, weights = jnp.ones(done.shape, bool), time, []

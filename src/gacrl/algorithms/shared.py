@@ -30,14 +30,14 @@ def share_out(tree: PyTree) -> PyTree:
 
 
 def num_shares() -> int:
-    """Devices of the axis `envs`."""
+    """Return how many devices the axis `envs` has."""
     return dict(jax.sharding.get_abstract_mesh().shape).get(ENVS, 1)
 
 
 def sum_over_devices(
     function: Callable[[PyTree, Int[Array, " R"]], PyTree], whole: PyTree, rows: Int[Array, " R"]
 ) -> PyTree:
-    """function(whole, rows), summed over shares of the rows, of which each device of the axis `envs` has one.
+    """Return function(whole, rows), summed over shares of the rows, of which each device of the axis `envs` has one.
 
     Of all rows where there is one device, or no even share. The terms are told as one vector: of several arrays each is
     a message, which costs more than its numbers.
@@ -60,12 +60,17 @@ def sum_over_devices(
 
 
 def clipped_adam(max_grad_norm: float, eps: float = 1e-8) -> optax.GradientTransformation:
-    """Adam's directions (to be multiplied by the step size) of gradients shortened to a norm, on one flat vector."""
+    """Make the transformation that gives Adam's directions (to be multiplied by the step size) of gradients shortened
+    to a norm, on one flat vector.
+    """
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.flatten(optax.scale_by_adam(eps=eps)))
 
 
 def taken(values: Float[Array, "*b A"], action: Int[Array, "*b"]) -> Float[Array, "*b"]:
-    """The entry of the action taken. (A product with the one-hot: the gradient of a lookup is a slow scatter.)"""
+    """Return the entry of the action taken.
+
+    (A product with the one-hot: the gradient of a lookup is a slow scatter.)
+    """
     chosen = jax.nn.one_hot(action, values.shape[-1], dtype=bool)
     return jnp.where(chosen, values, 0.0).sum(-1)
 
@@ -73,12 +78,12 @@ def taken(values: Float[Array, "*b A"], action: Int[Array, "*b"]) -> Float[Array
 def mean_real(
     values: Float[Array, "*b"], real: Bool[Array, "*b"], count: Int[Array, ""] | None = None
 ) -> Float[Array, ""]:
-    """Mean over the real agents; with their count, a share's part of the mean over all shares."""
+    """Return the mean over the real agents; with their count, a share's part of the mean over all shares."""
     return jnp.where(real, values, 0.0).sum() / jnp.maximum(real.sum() if count is None else count, 1)
 
 
 def share_reward(reward: Float[Array, "*b N"], real: Bool[Array, "*b N"], team: bool) -> Float[Array, "*b N"]:
-    """The mean over the real agents for everyone, or each its own."""
+    """Return the mean over the real agents for everyone, or each its own."""
     if not team:
         return reward
     mean = jnp.where(real, reward, 0.0).sum(-1, keepdims=True) / jnp.maximum(real.sum(-1, keepdims=True), 1)

@@ -31,7 +31,7 @@ class Cluster:
     """Seconds to wait for the others."""
 
     def check(self) -> None:
-        """Raises UserError where half of it is said."""
+        """Raise UserError where half of it is said."""
         given = [self.coordinator, self.num_processes, self.process_id]
         if not self.distributed and given != [None] * 3:
             raise UserError("--coordinator, --num-processes and --process-id need --distributed")
@@ -104,11 +104,11 @@ class Settings(RunConfig):
 
     @classmethod
     def of(cls, config: RunConfig) -> "Settings":
-        """The same settings."""
+        """Return the same settings."""
         return cls(**{field.name: getattr(config, field.name) for field in fields(RunConfig)})
 
     def plain(self) -> RunConfig:
-        """The same settings, as everyone else has them."""
+        """Return the same settings, as everyone else has them."""
         return RunConfig(**{field.name: getattr(self, field.name) for field in fields(RunConfig)})
 
 

@@ -5,7 +5,7 @@ import inspect
 import io
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -41,6 +41,15 @@ def parse(kind: type[Arguments], words: list[str], command: str, default: Argume
 def parse_known(kind: type[Arguments], words: list[str], command: str) -> tuple[Arguments, list[str]]:
     """Return the same, and the words that are none of its flags."""
     return _parsed(kind, words, command, None)
+
+
+@contextlib.contextmanager
+def called(flag: str, setting: str) -> Generator[None]:
+    """Call a setting that is out of range by the flag that set it."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(str(error).replace(setting, flag)) from error
 
 
 def whole_number(text: str) -> int:
@@ -224,7 +233,7 @@ class _Changed:
 
 
 def changed(settings: Any, words: list[str], command: str, kind: type) -> Any:
-    """A task's settings with those that `--env.X V`, or `--X V`, say.
+    """Return a task's settings with those that `--env.X V`, or `--X V`, say.
 
     kind: the arguments of the command, whose other flags may be meant. Raises UserError (ConfigError out of range).
     """

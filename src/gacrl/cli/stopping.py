@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
-    """The first SIGINT or SIGTERM asks for a stop at the next checkpoint, the next one is not ours."""
+    """Let the first SIGINT or SIGTERM ask for a stop at the next checkpoint; the next one is not ours."""
 
     def handler(number: int, frame: Any) -> None:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)

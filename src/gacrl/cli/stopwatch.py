@@ -16,7 +16,7 @@ def begin(with_process: bool) -> None:
 
 
 def seconds() -> float:
-    """Seconds since then."""
+    """Return the seconds since then."""
     return time.monotonic() - _begun
 
 

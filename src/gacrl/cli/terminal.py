@@ -60,7 +60,7 @@ class TerminalWatcher:
         self._say("stopping after the evaluation under way; once more to stop at once")
 
     def watcher(self) -> Watcher:
-        """The functions that a session calls."""
+        """Return the functions that a session calls."""
         return Watcher(
             planned=self._planned,
             compiling=lambda: self._say("compiling the training program"),
@@ -115,7 +115,7 @@ class TerminalWatcher:
         self._line.fraction = progress.env_steps / progress.total_env_steps
 
     def report(self, run: Ended) -> None:
-        """The end: what was reached, the paper's tables where they apply, and where everything lies."""
+        """Print the end: what was reached, the paper's tables where they apply, and where everything lies."""
         self._live.stop()
         if self.quiet:
             return
@@ -226,7 +226,7 @@ class RunsWatcher:
         self._print(sentence)
 
     def watcher(self, name: str) -> Watcher:
-        """The functions that the session of that run calls."""
+        """Return the functions that the session of that run calls."""
         line = self._line = _Line(name)
         self._live.update(line)
         self._printed = -math.inf

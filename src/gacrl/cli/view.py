@@ -2,12 +2,12 @@
 
 import contextlib
 import json
-import sys
 import webbrowser
 from collections.abc import Generator
 from typing import TYPE_CHECKING, Any
 
 from gacrl import tasks
+from gacrl.cli.output import warn
 from gacrl.cli.words import Words
 from gacrl.extras import require_extra
 
@@ -37,7 +37,7 @@ def view(words: Words) -> int:
         return parsing.changed(settings, [*rest, *short], "view", arguments.View)
 
     with running.listening(asked.host, asked.port) as listener:
-        cast = open_cast(asked.run, words.task or tasks.DEFAULT, change, asked.sampled, _warn)
+        cast = open_cast(asked.run, words.task or tasks.DEFAULT, change, asked.sampled, warn)
         print(f"compiling the policy of {' and '.join(asked.run)}", flush=True)
         running.warm_up(cast)
         board = Board()
@@ -67,7 +67,3 @@ def shown(page: "Page", words: Words, terminal: "TerminalWatcher") -> "Generator
 
     with page_beside(page.view_host, page.view_port, words.named, terminal.note) as watcher:
         yield watcher
-
-
-def _warn(sentence: str) -> None:
-    print(f"gacrl: {sentence}", file=sys.stderr)

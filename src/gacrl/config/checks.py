@@ -12,7 +12,7 @@ from gacrl.errors import ConfigError
 
 
 def require(condition: bool, message: str) -> None:
-    """Raises ConfigError with the message unless the condition holds."""
+    """Raise ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)
 
@@ -61,7 +61,7 @@ def whole(value: Any, name: str, low: int | None = None) -> int:
 
 
 def require_kind(name: str, value: Any, kinds: tuple[type, ...], expected: str) -> None:
-    """Raises ConfigError, with the value and its type, for an argument of another type than these."""
+    """Raise ConfigError, with the value and its type, for an argument of another type than these."""
     kind = type(value).__name__
     require(isinstance(value, kinds), f"{name} must be {expected}, not {reprlib.repr(value)} (of type {kind})")
 
@@ -90,7 +90,7 @@ def _told(value: Any) -> str:
 
 
 def between(section: str, settings: object, low: int | float, high: int | float, *names: str) -> None:
-    """Raises ConfigError for a named setting outside the bounds, or NaN; None is no number, and passes.
+    """Raise ConfigError for a named setting outside the bounds, or NaN; None is no number, and passes.
 
     The settings have taken their types.
     """
@@ -135,7 +135,8 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that is meant: by a synonym of its last part, by that part, or by its letters; None: nobody knows.
+    """Return the known name that is meant: by a synonym of its last part, by that part, or by its letters; None: nobody
+    knows.
 
     Names may be settings (`algorithm.learning_rate`) or flags (`--algorithm.learning-rate`).
     """
@@ -155,7 +156,7 @@ def _last_part(name: str) -> str:
 
 
 def unknown(kind: str, name: str, known: Mapping[str, Any] | set[str] | list[str], hint: str = "") -> str:
-    """The sentence for a name that is not among the known ones, with the nearest of them."""
+    """Return the sentence for a name that is not among the known ones, with the nearest of them."""
     near = nearest(name, known)
     mend = f"did you mean '{near}'?" if near else f"known: {', '.join(sorted(known))}"
     return f"unknown {kind} {name!r}: {mend}" + (f" ({hint})" if hint else "")

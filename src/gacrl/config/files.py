@@ -39,7 +39,7 @@ def preset(name: str = presets.DEFAULT_PRESET, **changes: Any) -> RunConfig:
 
 
 def to_dict(config: RunConfig) -> dict[str, Any]:
-    """The settings as plain data, complete; the names of algorithm and task stand among their settings."""
+    """Return the settings as plain data, complete; the names of algorithm and task stand among their settings."""
     data = dataclasses.asdict(config)
     task = data.pop("task")
     return {
@@ -120,13 +120,13 @@ def load(path: Path, base: RunConfig | None = None) -> RunConfig:
 
 
 def dumps(config: RunConfig) -> str:
-    """The settings as the text of a loadable file."""
+    """Return the settings as the text of a loadable file."""
     return json.dumps(to_dict(config), indent=2) + "\n"
 
 
 def fingerprint(settings: RunConfig | Mapping[str, Any]) -> str:
-    """A hash of every setting but the run's length, which may be extended, and the processes that its environments are
-    spread over: what a checkpoint belongs to.
+    """Return a hash of every setting but the run's length, which may be extended, and the processes that its
+    environments are spread over: what a checkpoint belongs to.
 
     Of plain data: of the settings that stand in it, whatever further ones there are by now, so that a run made before
     a setting was added can still go on.

@@ -30,7 +30,7 @@ EXPLORATION: dict[str, Any] = {
 
 
 def resolve(entry: Any) -> Any:
-    """What an entry stands for."""
+    """Return what an entry stands for."""
     if not isinstance(entry, str):
         return entry
     module, _, name = entry.partition(":")

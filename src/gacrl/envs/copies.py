@@ -25,7 +25,7 @@ def reset(env: Environment, params: EnvParams, keys: Keys) -> tuple[EnvState, Ob
 def step(
     env: Environment, params: EnvParams, state: EnvState, action: Array, key: PRNGKey
 ) -> tuple[EnvState, Observation, TimeStep]:
-    """One step of each copy: where it goes on from, what is seen there, and what the step brought.
+    """Take one step of each copy: where it goes on from, what is seen there, and what the step brought.
 
     Where an episode has ended the first two are those of a new one; the third holds the last observation of the old.
     """
@@ -48,7 +48,7 @@ def begin_anew(
     observation: Observation,
     keys: Callable[[], Keys],
 ) -> tuple[EnvState, Observation]:
-    """A reset where the episode is over. The keys are asked for only if one is.
+    """Reset each copy where its episode is over. The keys are asked for only if one is.
 
     What a conditional hands through is copied, so that where observations can be made from the state they are.
     """

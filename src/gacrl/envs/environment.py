@@ -73,7 +73,7 @@ class Environment(ABC):
             cls.step = _refusing_odd_actions(cls.step)
 
     def default_params(self) -> EnvParams:
-        """The numbers of the task, where it has some."""
+        """Return the numbers of the task, where it has some."""
         return ()
 
     @abstractmethod
@@ -90,8 +90,9 @@ class Environment(ABC):
         """
 
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors, as other programs hand them out: everyone is there, and may do
-        everything."""
+        """Return the observation around bare feature vectors, as other programs hand them out: everyone is there, and
+        may do everything.
+        """
         return observe(features, num_actions=self.num_actions)
 
     def stack(self, rows: Sequence[Any]) -> Float[np.ndarray, "N O"]:
@@ -135,11 +136,11 @@ class Environment(ABC):
         return observation.features
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
-        """The observation of the turned world."""
+        """Return the observation of the turned world."""
         return observation
 
     def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
-        """The action that does in the turned world what this one does here."""
+        """Return the action that does in the turned world what this one does here."""
         return action
 
     def idle(self) -> Float[np.ndarray, "N A"]:
@@ -157,7 +158,7 @@ class Environment(ABC):
         return jax.vmap(self.step, (0, 0, 0, None))(state, action, keys, params)
 
     def observe_many(self, state: EnvState, params: EnvParams = ()) -> Observation:
-        """What is seen in each of E states, for a task that `observes_state`."""
+        """Return what is seen in each of E states, for a task that `observes_state`."""
         raise NotImplementedError
 
     def seen_in(self, state: EnvState, params: EnvParams = ()) -> Observation | None:

@@ -38,14 +38,16 @@ class Physics(NamedTuple):
 
 
 def along(values: Array, like: Array) -> Array:
-    """Numbers that all worlds share, with an axis of one for each axis that an array of worlds has at its end."""
+    """Return the numbers that all worlds share, with an axis of one for each axis that an array of worlds has at its
+    end.
+    """
     return values.reshape(values.shape + (1,) * (like.ndim - values.ndim))
 
 
 def pairwise_offsets(
     positions: Float[Array, "N 2 *e"], others: Float[Array, "M 2 *e"]
 ) -> tuple[Float[Array, "N M 2 *e"], Float[Array, "N M *e"]]:
-    """From each position to each of the others: offset `others - position`, and its length."""
+    """Return, from each position to each of the others, the offset `others - position`, and its length."""
     offsets = others[None] - positions[:, None]
     return offsets, jnp.sqrt(jnp.square(offsets).sum(2))
 
@@ -53,7 +55,7 @@ def pairwise_offsets(
 def between_agents(
     positions: Float[Array, "N 2 *e"], agent_mask: Bool[Array, " N"] | None
 ) -> tuple[Float[Array, "N N 2 *e"], Float[Array, "N N *e"], Bool[Array, "N N *#e"]]:
-    """From each agent to each agent: offset, distance, and whether the two are real and not one."""
+    """Return, from each agent to each agent, offset, distance, and whether the two are real and not one."""
     offsets, distance = pairwise_offsets(positions, positions)
     pairs = ~jnp.eye(positions.shape[0], dtype=bool)
     if agent_mask is not None:
@@ -64,7 +66,7 @@ def between_agents(
 def contact_forces(
     positions: Float[Array, "N 2 *e"], agent_mask: Bool[Array, " N"] | None, physics: Physics
 ) -> Float[Array, "N 2 *e"]:
-    """The force on each agent from its contacts with the others (a softplus of the penetration).
+    """Return the force on each agent from its contacts with the others (a softplus of the penetration).
 
     Two agents at the very same point have no direction to be pushed in: the force there is 0, where MPE2
     divides by zero and gives NaN.
@@ -78,7 +80,7 @@ def contact_forces(
 
 
 def action_forces(action: Array, physics: Physics, continuous: bool) -> Float[Array, "N 2 *e"]:
-    """The force of each agent's own action.
+    """Return the force of each agent's own action.
 
     Discrete: indices [N, *e] into `DIRECTIONS`. Continuous: [N, 5, *e] in [0, 1], clipped there as MPE2's wrapper
     does; the force is right minus left, up minus down.
@@ -96,7 +98,7 @@ def integrate(
     forces: Float[Array, "N 2 *e"],
     physics: Physics,
 ) -> tuple[Float[Array, "N 2 *e"], Float[Array, "N 2 *e"]]:
-    """One step: positions move with the old velocity, then velocities are damped and pushed (mass 1)."""
+    """Take one step: positions move with the old velocity, then velocities are damped and pushed (mass 1)."""
     moved = positions + velocities * physics.time_step
     return moved, velocities * (1 - physics.damping) + forces * physics.time_step
 

@@ -29,11 +29,15 @@ BEST_RETURN = {"action": 1.0, "both": 1.0, "message": 1.0, "late_message": 1.0}
 
 
 class ProbeParams(NamedTuple):
+    """Which probe is played."""
+
     probe: Int[Array, ""] | int = 0
     """Index into `PROBES`."""
 
 
 class ProbeState(NamedTuple):
+    """A probe in an episode."""
+
     sign: Float[Array, ""]
     """−1 or 1: what the first agent may see, and what is to be matched."""
     clock: Int[Array, ""]
@@ -85,7 +89,7 @@ class Probe(Environment):
         )
 
     def observe(self, state: ProbeState, params: ProbeParams) -> Observation:
-        """The first agent sees the sign, where there is something to see, and the clock; the second nothing."""
+        """Show the first agent the sign, where there is something to see, and the clock; the second nothing."""
         blind = _is(params, "value") | _is(params, "discount") | _is(params, "action")
         seen = jnp.where(blind, 0.0, state.sign)
         features = jnp.zeros((self.num_agents, self.observation_size))
@@ -102,6 +106,8 @@ NOBODY = -1
 
 
 class RiddleState(NamedTuple):
+    """The riddle on one day."""
+
     today: Int[Array, ""]
     """Who is in the room."""
     yesterday: Int[Array, ""]

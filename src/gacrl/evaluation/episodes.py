@@ -1,12 +1,10 @@
 """Episodes as they happened: recorded from a policy, kept in a file, shown by pictures and the viewer."""
 
-import contextlib
 import io
-import os
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +15,7 @@ from gacrl import rollout
 from gacrl.envs.environment import Environment, EnvParams, EnvState, typed_keys
 from gacrl.envs.hosted import Copies, Hosted
 from gacrl.evaluation import on_host
+from gacrl.replacing import replaced
 from gacrl.scene import Discs, Scene, compose, discs
 from gacrl.types import Intervention, Memory, Observation, Policy, PRNGKey, Transition
 
@@ -73,7 +72,7 @@ class Episode:
 
     def save(self, path: Path) -> None:
         """Write the episode as an .npz of plain arrays. Raises OSError where the file cannot be written."""
-        with written_whole(path) as file:
+        with replaced(path) as file:
             np.savez_compressed(file, allow_pickle=False, **_flat(self))
 
     @classmethod
@@ -172,20 +171,9 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"{name} must not be below 0")
 
 
-@contextlib.contextmanager
-def written_whole(path: Path) -> Generator[BinaryIO]:
-    """A file that appears under its name complete, or not at all. Raises OSError."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with unfinished.open("wb") as file:
-            yield file
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
 def recorded_bytes(env: Environment, params: EnvParams, num_episodes: int, look: Look | None = None) -> int:
-    """Memory that recorded episodes take at the least: what is seen and earned in every step up to the time limit.
+    """Return the memory that recorded episodes take at the least: what is seen and earned in every step up to the time
+    limit.
 
     Counted from shapes: nothing is played.
     """
@@ -249,7 +237,7 @@ def play(
     intervention: Intervention | None = None,
     look: Look | None = None,
 ) -> Played:
-    """What `record_many` compiles: K environments from their start to the time limit."""
+    """Play what `record_many` compiles: K environments from their start to the time limit."""
 
     def one_step(
         carry: rollout.Carry, key: PRNGKey
@@ -351,7 +339,7 @@ def _episode(played: Played, k: int) -> Episode:
 
 
 def sized(scene: Scene | None) -> Scene | None:
-    """Agents without a radius get one that suits the picture: a twentieth of the way that all of them cover."""
+    """Give agents without a radius one that suits the picture: a twentieth of the way that all of them cover."""
     if scene is None or scene.agents.radius.any():
         return scene
     places = scene.agents.positions.reshape(-1, 2)

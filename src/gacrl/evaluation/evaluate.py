@@ -24,7 +24,7 @@ _EVALUATION_SEED = 20_260_101
 
 
 def stream_key(stream: Stream, seed: int = _EVALUATION_SEED) -> PRNGKey:
-    """The root key of a stream of random numbers; the name is folded in, so streams never coincide."""
+    """Return the root key of a stream of random numbers; the name is folded in, so streams never coincide."""
     return jax.random.fold_in(jax.random.key(seed), zlib.crc32(stream.encode()))
 
 
@@ -38,7 +38,7 @@ def evaluate(
     intervention: Intervention | None = None,
     metrics: Mapping[str, Metric] = RETURN,
 ) -> dict[str, Float[Array, " K"]]:
-    """The metrics of K episodes, each up to its end or the environment's time limit.
+    """Measure K episodes, each up to its end or the environment's time limit.
 
     intervention: what happens to the agents' messages. metrics: those of the task; a measure without one gets its
     mean. The key fixes the starts and the policy's draws:

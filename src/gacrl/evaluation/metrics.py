@@ -29,7 +29,7 @@ class Table(NamedTuple):
 
 
 def table_of(measures: Sequence[str], metrics: Mapping[str, Metric]) -> Table:
-    """The metrics of a task that measures these things."""
+    """Return the metrics of a task that measures these things."""
     known = {**metrics, **{name: metric for name, metric in RETURN.items() if name not in metrics}}
     defined = {name: metric for name, metric in known.items() if metric.measure in measures}
     bare = sorted(set(measures) - {metric.measure for metric in defined.values()})
@@ -37,7 +37,7 @@ def table_of(measures: Sequence[str], metrics: Mapping[str, Metric]) -> Table:
 
 
 def measures_of(env: Environment, params: EnvParams) -> list[str]:
-    """The names of what a step of this task measures."""
+    """Return the names of what a step of this task measures."""
 
     def info() -> Metrics:
         key = jax.random.key(0)
@@ -58,7 +58,7 @@ class Tally(NamedTuple):
 
 
 def no_steps(table: Table) -> Tally:
-    """The tally before an episode's first step."""
+    """Return the tally before an episode's first step."""
     zeros = jnp.zeros(len(table.measures))
     return Tally(zeros, zeros, jnp.zeros((), jnp.int32))
 
@@ -70,13 +70,13 @@ def count_step(tally: Tally, info: Metrics) -> Tally:
 
 
 def count_step_if(going: Bool[Array, ""], tally: Tally, info: Metrics) -> Tally:
-    """The same for an episode that is still going on; one that has ended stays as it ended."""
+    """Return the same for an episode that is still going on; one that has ended stays as it ended."""
     counted = count_step(tally, info)
     return jax.tree.map(lambda new, old: jnp.where(going, new, old), counted, tally)
 
 
 def episode_metrics(tally: Tally, table: Table) -> Float[Array, " K"]:
-    """The metrics of a finished episode, in the order of the table."""
+    """Return the metrics of a finished episode, in the order of the table."""
     means = tally.total / jnp.maximum(tally.steps, 1)
     candidates = jnp.concatenate([means, tally.total, tally.last])
     offset = {"mean": 0, "sum": len(table.measures), "last": 2 * len(table.measures)}
@@ -100,7 +100,7 @@ def no_episodes(table: Table) -> EpisodeSummary:
 
 
 def sum_up(episodes: Float[Array, "T E K"], done: Bool[Array, "T E"]) -> EpisodeSummary:
-    """The episodes that ended in a rollout; of several that ended last, the first environment's is `last`."""
+    """Return the episodes that ended in a rollout; of several that ended last, the first environment's is `last`."""
     finished = jnp.where(done[..., None], episodes, 0.0)
     when = done.shape[0] - 1 - jnp.argmax(done.any(1)[::-1])
     return EpisodeSummary(

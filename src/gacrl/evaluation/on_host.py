@@ -55,7 +55,7 @@ class Moment(NamedTuple):
 def evaluate(
     env: Hosted, playing: Actors, key: PRNGKey, num_episodes: int, metrics: Mapping[str, Metric]
 ) -> dict[str, Float[np.ndarray, " K"]]:
-    """The metrics of K episodes, as `evaluate.evaluate` has them. Raises Faulty."""
+    """Measure K episodes, as `evaluate.evaluate` has them. Raises Faulty."""
     table = table_of(measures_of(env, ()), metrics)
     count, close = _counting(table)
     played: list[np.ndarray] = []

@@ -22,7 +22,7 @@ FLOORS = ("random", "noop")
 
 
 def random(env: Environment) -> Actor:
-    """Every available action is equally likely."""
+    """Act at random: every available action is equally likely."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
@@ -35,7 +35,7 @@ def random(env: Environment) -> Actor:
 
 
 def noop(env: Environment) -> Actor:
-    """Every agent takes its first available action, or pushes nowhere."""
+    """Do nothing: every agent takes its first available action, or pushes nowhere."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if env.continuous_actions:
@@ -46,18 +46,18 @@ def noop(env: Environment) -> Actor:
 
 
 def playable(task: Task) -> list[str]:
-    """The scripted policies of a task, by name."""
+    """Return the scripted policies of a task, by name."""
     return [*FLOORS, *task.references]
 
 
 def shown(task: Task) -> list[str]:
-    """Those that stand beside every number: the floors, the first of the task's own, and the silent one."""
+    """Return those that stand beside every number: the floors, the first of the task's own, and the silent one."""
     own = [name for i, name in enumerate(task.references) if i == 0 or name == SILENT]
     return [*FLOORS, *own]
 
 
 def actor(task: Task, name: str, env: Environment) -> Actor:
-    """The scripted policy of that name in this environment. Raises ConfigError where there is none."""
+    """Return the scripted policy of that name in this environment. Raises ConfigError where there is none."""
     makers: dict[str, Callable[[Any], Actor]] = {"random": random, "noop": noop, **task.references}
     if name not in makers:
         raise ConfigError(unknown("scripted policy", name, list(makers), f"of {task.name}"))
@@ -65,7 +65,7 @@ def actor(task: Task, name: str, env: Environment) -> Actor:
 
 
 def evaluate_scripted(task: str, settings: Any, num_episodes: int) -> dict[str, dict[str, float]]:
-    """The metrics of those that are shown, on the very starts of the closing evaluation."""
+    """Return the metrics of those that are shown, on the very starts of the closing evaluation."""
     return {name: play_scripted(name, task, settings, num_episodes) for name in shown(tasks.find(task))}
 
 
@@ -86,7 +86,7 @@ def scripted_episodes(name: str, task: str, settings: Any, num_episodes: int) ->
 def scripted_program(
     name: str, task: str, settings: Any, num_episodes: int
 ) -> Callable[..., dict[str, jax.Array]]:
-    """A scripted policy's evaluation, traced once a process."""
+    """Return a scripted policy's evaluation, traced once a process."""
     found = tasks.find(task)
     env = found.make(settings)
 
@@ -98,5 +98,5 @@ def scripted_program(
 
 
 def look_of(task: Task, settings: Any) -> Look | None:
-    """What there is to see of a state of this task as it is set; None: where agents are, if that is known."""
+    """Return what there is to see of a state of this task as it is set; None: where agents are, if that is known."""
     return None if task.scene is None else partial(task.scene, settings)

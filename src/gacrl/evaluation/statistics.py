@@ -76,7 +76,7 @@ class Curve(NamedTuple):
 
 
 def with_interval(found: Estimate | Difference | tuple[float, float, float], form: str = ".3f") -> str:
-    """A number and its bounds, to be read: "0.973 [0.971, 0.976]"."""
+    """Return a number and its bounds, to be read: "0.973 [0.971, 0.976]"."""
     point, low, high = (f"{number:{form}}" for number in found[:3])
     return f"{point} [{low}, {high}]"
 
@@ -94,7 +94,7 @@ def iqm(values: Numbers) -> Any:
 
 
 def mean(values: Numbers) -> Any:
-    """Mean of all scores: [S] or [..., S, K] to [...]. Raises as `iqm` does."""
+    """Return the mean of all scores: [S] or [..., S, K] to [...]. Raises as `iqm` does."""
     return _some(values).mean((-2, -1))
 
 
@@ -111,7 +111,7 @@ def median(values: Numbers) -> Any:
 
 
 def optimality_gap(values: Numbers, optimum: float = 1.0) -> Any:
-    """The mean shortfall from the optimum; scores beyond it count as reaching it. [S] or [..., S, K] to [...].
+    """Return the mean shortfall from the optimum; scores beyond it count as reaching it. [S] or [..., S, K] to [...].
 
     Raises as `iqm` does.
     """
@@ -120,7 +120,7 @@ def optimality_gap(values: Numbers, optimum: float = 1.0) -> Any:
 
 
 def estimate(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Estimate:
-    """A statistic of scores [S] or [S, K] with its 95 % stratified-bootstrap interval.
+    """Return a statistic of scores [S] or [S, K] with its 95 % stratified-bootstrap interval.
 
     statistic: reduces [..., S, K] to [...]. Raises UserError for fewer than two seeds, or what is not a number.
     """
@@ -130,7 +130,7 @@ def estimate(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed
 
 
 def difference(a: Numbers, b: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Difference:
-    """The statistic of a less that of b, with its 95 % interval: both are resampled, independently.
+    """Return the statistic of a less that of b, with its 95 % interval: both are resampled, independently.
 
     a: [S] or [S, K]; b: [S'] or [S', K]. Raises UserError for fewer than two seeds, other tasks, or NaN.
     """
@@ -143,7 +143,7 @@ def difference(a: Numbers, b: Numbers, statistic: Statistic = iqm, reps: int = 2
 
 
 def detectable(a: Numbers, b: Numbers) -> float:
-    """The smallest difference of means that a two-sided t-test at 5 % sees with 80 % power (Cohen 1988, ch. 2).
+    """Return the smallest difference of means that a two-sided t-test at 5 % sees with 80 % power (Cohen 1988, ch. 2).
 
     The spread is pooled over both, within tasks. Scores as for `difference`. An IQM of scores that are about
     normal spreads some 10 % wider than their mean: for it, read this as a lower bound.
@@ -165,7 +165,7 @@ def probability_of_improvement(a: Numbers, b: Numbers, reps: int = 2000, seed: i
 
 
 def equivalent(a: Numbers, b: Numbers, margin: float) -> Equivalence:
-    """Whether the means of a and b differ by less than `margin`: two one-sided Welch tests (Schuirmann 1987).
+    """Return whether the means of a and b differ by less than `margin`: two one-sided Welch tests (Schuirmann 1987).
 
     That an interval includes 0 shows no equality; only this does. Scores as for `difference`; of K tasks it is
     the means over tasks that are compared. Raises UserError for a margin that is not positive.
@@ -186,14 +186,14 @@ def equivalent(a: Numbers, b: Numbers, margin: float) -> Equivalence:
 
 
 def require_margin(margin: float) -> None:
-    """Raises UserError for one that is not positive, or infinite."""
+    """Raise UserError for one that is not positive, or infinite."""
     _require_finite(margin, "the margin of an equivalence")
     if not margin > 0:
         raise UserError(f"the margin of an equivalence must be positive, not {margin}")
 
 
 def performance_profile(values: Numbers, thresholds: Numbers, reps: int = 2000, seed: int = 0) -> Curve:
-    """The share of runs that score above each of P thresholds, with pointwise 95 % intervals.
+    """Return the share of runs that score above each of P thresholds, with pointwise 95 % intervals.
 
     values: [S] or [S, K]; thresholds: [P]. Raises UserError as `estimate` does.
     """
@@ -207,7 +207,7 @@ def performance_profile(values: Numbers, thresholds: Numbers, reps: int = 2000, 
 
 
 def sample_efficiency(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Curve:
-    """A statistic at each of P evaluations, pointwise 95 % intervals; a resampled seed brings its whole curve.
+    """Return a statistic at each of P evaluations, pointwise 95 % intervals; a resampled seed brings its whole curve.
 
     values: [S, P] of one task or [S, K, P]. Raises UserError for fewer than two seeds, or what is not a number.
     """

@@ -3,14 +3,12 @@
 Each part is a run folder of its own, so that a stopped ablation goes on with what is missing.
 """
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, SupportsIndex
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gacrl import tasks
 from gacrl.config import files as configuration
@@ -24,24 +22,23 @@ from gacrl.evaluation.statistics import (
     sample_efficiency,
     with_interval,
 )
+from gacrl.experiments import results
 from gacrl.experiments.parts import NO_MESSAGES, YOKED, parts_of
-from gacrl.experiments.provenance import Versions, commits, doubts, made_by
+from gacrl.experiments.provenance import Versions, code_of, doubts, made_by
+from gacrl.experiments.results import Finals, Values, reading, why_diverged
 from gacrl.experiments.study import (
     Planned,
     Watch,
     claim_folder,
-    read_summary,
-    reading,
     refuse_other_settings,
     train_missing,
-    why_diverged,
 )
 from gacrl.experiments.talking.kinds import num_parameters, with_central_critic
 from gacrl.experiments.worth import CLAIMED_FROM, remarkable, worths
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import Task
-from gacrl.training.recorder import RunFolder
 
 FULL = "all parts"
 EVALUATIONS = 45
@@ -57,12 +54,12 @@ class Outcome:
     name: str
     parameters: int
     """Of the acting network."""
-    final: Mapping[str, NDArray[np.float64]]
+    final: Finals
     """Per metric of the closing greedy evaluation [S]; empty for a run that diverged."""
     evaluated_at: tuple[int, ...]
-    along: NDArray[np.float64]
+    along: Values
     """The task's headline along training [S, P]."""
-    epsilon: NDArray[np.float64]
+    epsilon: Values
     """Mean share of random actions in each stretch [S, P]."""
     diverged: str | None = None
 
@@ -140,12 +137,14 @@ def ablate(
     task, outcomes = tasks.find(config.task), tuple(_outcome(run) for run in runs)
     made = made_by(run.folder for run in runs)
     done = Ablation(out, _report(out, config, configured, outcomes, made), task, outcomes, made)
-    (out / "summary.json").write_text(json.dumps(done.results(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.results())
     return done
 
 
 def plan(config: RunConfig, out: Path, parts: Sequence[str]) -> list[Planned]:
-    """The run with all parts, and one without each; the yoked one lacks the levels, which the first will give."""
+    """Return the run with all parts, and one without each; the yoked one lacks the levels, which the first will
+    give.
+    """
     wanted, known = num_parameters(config), parts_of(config)
     runs = [Planned(FULL, config, out / "all-parts")]
     for name in parts:
@@ -178,28 +177,15 @@ def _outcome(run: Planned) -> Outcome:
     if because is not None:
         return Outcome(run.name, num_parameters(run.config), {}, (), nothing, nothing, because)
     with reading(run.folder):
-        return _read_outcome(run)
-
-
-def _read_outcome(run: Planned) -> Outcome:
-    folder = RunFolder.open(run.folder)
-    summary = read_summary(folder, run.config)
-    rows = folder.metrics()
-    steps = tuple(sorted({row["env_steps"] for row in rows}))
-    by_seed = [[row for row in rows if row["seed"] == seed] for seed in run.config.seeds]
-    task = tasks.find(run.config.task)
-    return Outcome(
-        name=run.name,
-        parameters=num_parameters(run.config),
-        final={
-            metric: np.array(entry["values"])
-            for metric, entry in summary["final"]["greedy"].items()
-            if not metric.startswith("score_")
-        },
-        evaluated_at=steps,
-        along=np.array([[row["greedy"][task.headline] for row in seed] for seed in by_seed]),
-        epsilon=np.array([[row["update"]["epsilon"] for row in seed] for seed in by_seed]),
-    )
+        found = results.read(run.folder, run.config)
+        return Outcome(
+            name=run.name,
+            parameters=num_parameters(run.config),
+            final=found.final(),
+            evaluated_at=found.evaluated_at,
+            along=found.along("greedy", tasks.find(run.config.task).headline),
+            epsilon=found.along("update", "epsilon"),
+        )
 
 
 def _data(task: Task, outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -266,7 +252,7 @@ def _report(
     _exploration(page, task, ended)
     page.heading("How this was made")
     page.code(_command(config, outcomes))
-    page.text(f"Code of commit {', '.join(commits(made))}.")
+    page.text(code_of(made))
     return page.write(out, "report")
 
 

@@ -11,7 +11,7 @@ everything."""
 
 
 def row(name: str) -> dict[str, Any]:
-    """What must be done in a task, and the scores of its headline: None where nobody has measured one."""
+    """Return what must be done in a task, and the scores of its headline: None where nobody has measured one."""
     task = tasks.find(name)
     known = task.known()
     scores = known.get("scores", {})
@@ -25,7 +25,7 @@ def row(name: str) -> dict[str, Any]:
 
 
 def sentence(row: dict[str, Any]) -> str:
-    """The row as a line."""
+    """Return the row as a line."""
     told = [f"{who} {score:.2f}" for who, score in row["scores"].items() if score is not None]
     scores = f"; {row['headline']}: {', '.join(told)}" if told else ""
     return f"{row['task']:16}  {row['summary']}{scores}"

@@ -61,7 +61,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
 
 
 def parts_of(config: RunConfig) -> dict[str, Part]:
-    """All that these settings have and that can be taken away on this task."""
+    """Return all that these settings have and that can be taken away on this task."""
     known = {**PARTS, **tasks.find(config.task).parts}
     return {name: part for name, part in known.items() if configuration.from_dict(part.changes, config) != config}
 

@@ -31,6 +31,11 @@ def commits(made: Sequence[Versions]) -> list[str]:
     return sorted({versions.get(COMMIT, "unknown") for versions in made})
 
 
+def code_of(made: Sequence[Versions]) -> str:
+    """Write the sentence that closes a report."""
+    return f"Code of commit {', '.join(commits(made))}."
+
+
 def doubts(made: Sequence[Versions]) -> Iterator[str]:
     """Yield a sentence for each thing that keeps results from being followed to one clean commit."""
     code = commits(made)

@@ -246,7 +246,7 @@ def _distribution(one: Searched) -> Any:
 
 
 def encoded(spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values as Optuna has them: its choices are texts, whatever they stand for."""
+    """Return values as Optuna has them: its choices are texts, whatever they stand for."""
     choices = {one.setting for one in spec.searched if one.kind == "choice"}
     return {name: json.dumps(value) if name in choices else value for name, value in values.items()}
 

@@ -33,7 +33,7 @@ _HEARD = 32
 
 
 def unchanged(settings: Any) -> Any:
-    """The task as it was trained."""
+    """Return the task as it was trained."""
     return settings
 
 

@@ -23,7 +23,9 @@ from gacrl.config.checks import unknown
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
 from gacrl.evaluation.metrics import measures_of, table_of
-from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing, why_diverged
+from gacrl.experiments.results import why_diverged
+from gacrl.experiments.study import Planned, Watch, claim_folder, train_missing
+from gacrl.replacing import replace_json
 from gacrl.report.page import Page
 from gacrl.training.recorder import RunFolder
 
@@ -45,7 +47,7 @@ class Searched:
     """Lowest and highest, or the choices."""
 
     def at(self, share: float) -> Any:
-        """The value at a share in [0, 1) of the range."""
+        """Return the value at a share in [0, 1) of the range."""
         low, high = self.values[0], self.values[-1]
         if self.kind == "choice":
             return self.values[int(share * len(self.values))]
@@ -69,15 +71,15 @@ class Spec:
     trials: int
 
     def settings_of(self, values: Mapping[str, Any]) -> RunConfig:
-        """The trial with these values of the searched settings. Raises ConfigError."""
+        """Return the trial with these values of the searched settings. Raises ConfigError."""
         return configuration.from_dict(_nested(values), self.config)
 
     def values_of(self, config: RunConfig) -> dict[str, Any]:
-        """The values that a trial's settings have."""
+        """Return the values that a trial's settings have."""
         return {one.setting: _look_up(configuration.to_dict(config), one.setting) for one in self.searched}
 
     def trial(self, out: Path, values: Mapping[str, Any]) -> Planned:
-        """The trial with these values, in a folder that is named by them."""
+        """Return the trial with these values, in a folder that is named by them."""
         config = self.settings_of(values)
         text = json.dumps(self.values_of(config), sort_keys=True)
         name = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -253,7 +255,7 @@ def search(spec: Spec, out: Path, watch: Watch) -> Search | None:
 
 
 def proposals(spec: Spec) -> list[dict[str, Any]]:
-    """Values that fill the ranges evenly, each once; the first of many are those of few."""
+    """Return values that fill the ranges evenly, each once; the first of many are those of few."""
     shares = qmc.Halton(len(spec.searched), rng=spec.config.seed).random(16 * spec.trials)
     points = [{one.setting: one.at(float(s)) for one, s in zip(spec.searched, row, strict=True)} for row in shares]
     distinct = {json.dumps(point): point for point in points}
@@ -261,7 +263,7 @@ def proposals(spec: Spec) -> list[dict[str, Any]]:
 
 
 def trials_in(spec: Spec, out: Path) -> list[Trial]:
-    """What has been tried under `out`."""
+    """Return what has been tried under `out`."""
     found = [RunFolder(path.parent) for path in sorted(out.glob("trials/*/config.json"))]
     return [_trial(spec, folder) for folder in found]
 
@@ -279,14 +281,14 @@ def _trial(spec: Spec, folder: RunFolder) -> Trial:
 
 
 def value_of(spec: Spec, folder: RunFolder) -> tuple[float | None, int]:
-    """The metric at the last evaluation, and the environment steps that it came after."""
+    """Return the metric at the last evaluation, and the environment steps that it came after."""
     rows = folder.metrics() if folder.metrics_file.is_file() else []
     last = [row for row in rows if row["env_steps"] == rows[-1]["env_steps"]]
     return (mean_value(spec, last), last[0]["env_steps"]) if last else (None, 0)
 
 
 def mean_value(spec: Spec, rows: Sequence[Mapping[str, Any]]) -> float:
-    """The metric of one evaluation, over its seeds."""
+    """Return the metric of one evaluation, over its seeds."""
     return sum(row["greedy"][spec.metric] for row in rows) / len(rows)
 
 
@@ -323,7 +325,7 @@ def conclude(spec: Spec, out: Path) -> Search:
         page.code(f"gacrl train --config {out / 'best.json'} --seed {spec.config.seeds[-1] + 1}{task}")
     page.write(out, "report")
     done = Search(out, out / "report.html", ranked)
-    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.to_dict())
     return done
 
 

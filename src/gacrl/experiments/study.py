@@ -1,16 +1,14 @@
 """A folder of planned runs: it says what it is for, and a stopped study goes on with the runs that are missing."""
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
+from gacrl.replacing import replace_json, unfinished
 from gacrl.training import session
 from gacrl.training.devices import release_memory
 from gacrl.training.divergence import Diverged
@@ -46,36 +44,6 @@ class Watch:
     say: Callable[[str], None] = lambda sentence: None
 
 
-@contextmanager
-def reading(folder: Path) -> Generator[None]:
-    """Raises UserError where what is read from a run of a study turns out to be damaged."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, ValueError, RecursionError, OSError) as error:
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        raise UserError(f"{folder} is damaged ({what}): remove that folder to train the run again") from error
-
-
-def read_summary(folder: RunFolder, planned: RunConfig) -> dict[str, Any]:
-    """Return the summary of a finished run. Raises ValueError where its seeds are not those that were planned."""
-    summary = json.loads(folder.summary_file.read_text(encoding="utf-8"))
-    seeds = list(planned.seeds)
-    if summary["seeds"] != seeds:
-        raise ValueError(f"it holds seeds {summary['seeds']}, not {seeds}")
-    for metrics in summary["final"].values():
-        for metric, entry in metrics.items():
-            if metric.startswith("score_"):
-                continue
-            if len(entry["values"]) != len(seeds) or not np.isfinite(entry["values"]).all():
-                raise ValueError(f"a seed of {seeds} lacks a value of {metric}")
-    return summary
-
-
-def why_diverged(folder: Path) -> str | None:
-    """Why the run in that folder diverged; None for one that did not."""
-    return RunFolder(folder).why_diverged()
-
-
 def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
     """Train what is not finished, each from where it stopped; False where the watcher stopped it."""
     for planned in runs:
@@ -94,7 +62,7 @@ def train_missing(runs: Sequence[Planned], watch: Watch) -> bool:
 
 
 def refuse_other_settings(runs: Sequence[Planned]) -> None:
-    """Raises UserError where a run's folder holds a run with other settings than planned."""
+    """Raise UserError where a run's folder holds a run with other settings than planned."""
     for planned in runs:
         folder = planned.folder
         if (folder / "config.json").is_file() and RunFolder.open(folder).config() != planned.config:
@@ -112,7 +80,7 @@ def claim_folder(
     kind: what the study is called. other: the sentence about a folder that holds one of its kind with other settings,
     from those. Raises UserError for it, for a folder that holds something else, and for one that cannot be written.
     """
-    path, unfinished = out / marker, out / f".{marker}.unfinished"
+    path = out / marker
     if path.is_file():
         try:
             held: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -123,12 +91,11 @@ def claim_folder(
         if held != json.loads(json.dumps(asked)):  # as it would be read: tuples are lists
             raise UserError(f"{out} holds {other(held)}")  # pyright: ignore[reportUnknownArgumentType]
         return
-    if out.exists() and (not out.is_dir() or any(entry != unfinished for entry in out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(entry != unfinished(path) for entry in out.iterdir())):
         raise UserError(f"{out} exists and holds no {kind}: choose another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(json.dumps(asked, indent=2) + "\n", encoding="utf-8")
-        unfinished.replace(path)
+        replace_json(path, asked)
     except OSError as error:
         raise UserError(f"cannot write into {out}: {reason(error)}; choose another --out") from error
 

@@ -4,7 +4,6 @@ Each learner is a run folder of its own, so that a stopped study resumes with wh
 then played with its messages silenced, scrambled and delayed: only that shows whether anybody listens.
 """
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gacrl import tasks
 from gacrl.config import files as configuration
@@ -29,19 +27,20 @@ from gacrl.evaluation.statistics import (
     with_interval,
 )
 from gacrl.experiments import scoring
-from gacrl.experiments.provenance import Versions, commits, doubts, made_by
+from gacrl.experiments.provenance import Versions, code_of, doubts, made_by
+from gacrl.experiments.results import Finals, Values, why_diverged
 from gacrl.experiments.study import (
     Planned,
     Watch,
     claim_folder,
     refuse_other_settings,
     train_missing,
-    why_diverged,
 )
 from gacrl.experiments.talking.cells import CAUGHT
 from gacrl.experiments.talking.kinds import CLOSING_EPISODES, hears_by, num_parameters, talker
 from gacrl.experiments.talking.known import Known, read
 from gacrl.messages import interventions
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.tasks.task import HEADLINE, MATTERS, Task
@@ -85,12 +84,12 @@ class Talk:
     config: RunConfig
     parameters: Mapping[str, int]
     """Of each learner's acting network."""
-    returns: Mapping[str, NDArray[np.float64]]
+    returns: Finals
     """Of each learner, greedy, last parameters: a number for each seed [S]."""
-    played: Mapping[str, NDArray[np.float64]]
+    played: Finals
     """Of the talking learner by what happens to its messages [S]."""
     answer: Answer
-    further: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
+    further: Mapping[str, Finals] = field(default_factory=dict)
     """The other metrics of the task's tables, by their labels: of each learner and of what is played, as `measured`."""
     made_by: Sequence[Versions] = ()
     """The versions that trained the learners."""
@@ -98,7 +97,7 @@ class Talk:
     """The silent and the told learner, if they were trained before."""
 
     @property
-    def measured(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+    def measured(self) -> dict[str, dict[str, Values]]:
         """Every metric of the tables by its label: of the learners, then of the talking one with other messages [S]."""
         caught = {f"{TALKING}, {how}": values for how, values in self.played.items() if how != SENT}
         further = {label: dict(values) for label, values in self.further.items()}
@@ -190,7 +189,7 @@ def talk(
     done = _read(out, runs, before)
     page = _report(done)
     done = replace(done, report=page.write(out, "report"))
-    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.to_dict())
     return done
 
 
@@ -200,9 +199,7 @@ def plan(config: RunConfig, out: Path) -> list[Planned]:
     return [Planned(name, hears_by(_KINDS[name], config, parameters), out / name) for name in LEARNERS]
 
 
-def answer(
-    returns: Mapping[str, NDArray[np.float64]], played: Mapping[str, NDArray[np.float64]], random: float
-) -> Answer:
+def answer(returns: Finals, played: Finals, random: float) -> Answer:
     """Judge the returns [S] of the learners, of the talking one by what happens to its messages, and of random."""
     worth = difference(returns[TOLD], returns[SILENT], mean)
     used = estimate(played[SENT] - played[SCRAMBLED], mean)
@@ -239,7 +236,7 @@ def _read(out: Path, runs: Sequence[Planned], known: Known | None) -> Talk:
     return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made, known)
 
 
-def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, NDArray[np.float64]]:
+def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, Values]:
     """Every metric of each seed [S], greedy."""
     played = scoring.play(str(run), episodes, intervention=interventions.parse(intervention))
     return {metric: np.asarray(values.mean(1), float) for metric, values in played.items()}
@@ -294,7 +291,7 @@ def _report(done: Talk) -> Page:
         "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
     )
     page.code(_command(config, done.known))
-    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
+    page.text(code_of(done.made_by))
     return page
 
 
@@ -317,6 +314,6 @@ def _command(config: RunConfig, known: Known | None = None) -> str:
     return " ".join(words)
 
 
-def cells(values: NDArray[np.float64]) -> list[str]:
+def cells(values: Values) -> list[str]:
     """Write the mean of seeds with its interval, and every seed."""
     return [with_interval(estimate(values, mean), ".2f"), " ".join(f"{value:.2f}" for value in values)]

@@ -3,15 +3,10 @@
 from collections.abc import Mapping
 from typing import Literal, NamedTuple, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gacrl.evaluation.statistics import Difference, Estimate, difference, probability_of_improvement
+from gacrl.experiments.results import Finals, Values
 from gacrl.tasks.task import Task
 
-Values: TypeAlias = NDArray[np.float64]
-Finals: TypeAlias = Mapping[str, Values]
-"""Per metric: each seed's value [S]."""
 Said: TypeAlias = Literal["helps", "costs", "may help", "may cost", ""]
 
 CLAIMED_FROM = 10
@@ -36,12 +31,12 @@ def worths(task: Task, whole: Finals, without: Finals) -> dict[str, Worth]:
 
 
 def remarkable(found: Mapping[str, Worth]) -> dict[str, Worth]:
-    """Those of which something may be said."""
+    """Return those of which something may be said."""
     return {metric: worth for metric, worth in found.items() if worth.said}
 
 
 def _worth(task: Task, metric: str, whole: Values, without: Values) -> Worth:
-    sign = 1.0 if task.metric(metric).higher_is_better else -1.0
+    sign = task.metric(metric).sign
     probability = probability_of_improvement(sign * whole, sign * without)
     enough = min(len(whole), len(without)) >= CLAIMED_FROM
     said: Said = ""

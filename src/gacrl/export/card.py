@@ -9,6 +9,7 @@ from gacrl.errors import UserError
 from gacrl.export import card_of
 from gacrl.export.program import Program
 from gacrl.export.source import Source
+from gacrl.report.page import markdown_table
 from gacrl.versions import version, versions
 
 
@@ -32,10 +33,12 @@ def card(source: Source, program: Program, file: str, checked: str = "") -> str:
         "Actions": _actions(names, run.env.num_actions, run.env.continuous_actions),
         "Inputs and outputs": _signature(program),
         "Architecture": _block(settings["algorithm"].get("network", settings["algorithm"])),
-        "Tensors": _table(("name", "shape"), [(f"`{n}`", str(list(w.shape))) for n, w in program.weights.items()]),
+        "Tensors": markdown_table(
+            ("name", "shape"), [(f"`{n}`", str(list(w.shape))) for n, w in program.weights.items()]
+        ),
         "Task": _block(settings["env"]),
         "What it reaches": _reached(source),
-        "Made by": _table(("what", "version"), list(_made_by(source).items())),
+        "Made by": markdown_table(("what", "version"), list(_made_by(source).items())),
     }
     first, *rest = sections.items()
     body = "\n".join(f"\n## {head}\n\n{text}" for head, text in rest)
@@ -54,14 +57,14 @@ def _summary(source: Source, program: Program) -> str:
 def _actions(names: Any, count: int, continuous: bool) -> str:
     if continuous:
         return f"{count} numbers in [0, 1] for each agent: " + ", ".join(names)
-    return _table(("action", "meaning"), list(enumerate(names or ["not named by the task"] * count)))
+    return markdown_table(("action", "meaning"), list(enumerate(names or ["not named by the task"] * count)))
 
 
 def _signature(program: Program) -> str:
     outputs = program.outputs
     rows = [("in", f"`{name}`", f"{it.dtype}{list(it.shape)}") for name, it in program.inputs.items()]
     rows += [("out", f"`{name}`", f"{it.dtype}{list(it.shape)}") for name, it in outputs.items()]
-    return _table(("", "name", "numbers"), rows)
+    return markdown_table(("", "name", "numbers"), rows)
 
 
 def _reached(source: Source) -> str:
@@ -74,7 +77,7 @@ def _reached(source: Source) -> str:
     seeds = ", ".join(map(str, summary["seeds"]))
     return (
         f"Greedy, {summary['episodes']} episodes of {summary['horizon']} steps, mean over the seeds {seeds}.\n\n"
-        + _table(("metric", "value"), rows)
+        + markdown_table(("metric", "value"), rows)
     )
 
 
@@ -98,11 +101,6 @@ def _summary_of(source: Source) -> dict[str, Any]:
         return {**summary, "final": {**summary["final"]}}
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} is damaged ({error}): move it away, and the card goes without it") from error
-
-
-def _table(columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def _block(values: Any) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
-from gacrl.evaluation.episodes import written_whole
 from gacrl.export.source import Source
+from gacrl.replacing import replaced
 from gacrl.training.trackers.rows import flat
 
 
@@ -21,8 +21,10 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     if not rows:
         raise UserError(f"{source.name} has no metrics.jsonl with an evaluation in it: train first")
     columns = dict.fromkeys(name for row in rows for name in row)
-    with written_whole(out) as binary, io.TextIOWrapper(binary, encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, columns, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    with replaced(out) as file:
+        file.write(text.getvalue().encode())
     return [out]

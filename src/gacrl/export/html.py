@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gacrl.errors import UserError
-from gacrl.evaluation.episodes import Episode, record_many, written_whole
+from gacrl.evaluation.episodes import Episode, record_many
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import look_of
 from gacrl.export import bundle, portable, replays
@@ -19,6 +19,7 @@ from gacrl.export.yardsticks import yardsticks
 from gacrl.messages import interventions
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
+from gacrl.replacing import replaced
 from gacrl.tasks.task import Task
 from gacrl.types import Intervention
 
@@ -43,7 +44,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
             f"the page would have {size:,} bytes, and a page has at most {MOST_BYTES:,}: train a narrower network, or "
             "export npz"
         )
-    with written_whole(out) as file:
+    with replaced(out) as file:
         file.write(text.encode())
     return [out]
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 from gacrl.errors import UserError
-from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.lean import lean
 from gacrl.export.program import Program, flattened, program
 from gacrl.export.recorded import Arrays, compared
 from gacrl.export.source import Source
 from gacrl.extras import require_extra
+from gacrl.replacing import replaced
 
 OPSET = 21
 """The version of ONNX's operators that the graph is of; it stands on the card."""
@@ -28,7 +28,7 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     data = convert(source, it)
     checked = compared(source, it, runner(data))
     card = write_card(source, it, out, f"{checked} Opset {OPSET}.")
-    with written_whole(out) as file:
+    with replaced(out) as file:
         file.write(data)
     return [out, card]
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import safetensors.numpy
 
-from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import program
 from gacrl.export.source import Source
+from gacrl.replacing import replaced
 from gacrl.versions import version
 
 
@@ -17,6 +17,6 @@ def write(source: Source, out: Path) -> Sequence[Path]:
     it, run = program(source), source.opened
     about = {"format": "gacrl", "gacrl": version(), "task": run.config.task, "preset": run.config.preset}
     card = write_card(source, it, out)
-    with written_whole(out) as file:
+    with replaced(out) as file:
         file.write(safetensors.numpy.save(it.weights, metadata=about))
     return [out, card]

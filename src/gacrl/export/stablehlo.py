@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jax import export
 
-from gacrl.evaluation.episodes import written_whole
 from gacrl.export.card import write_card
 from gacrl.export.program import flattened, program
 from gacrl.export.recorded import Arrays, compared
 from gacrl.export.source import Source
 from gacrl.extras import require_extra
+from gacrl.replacing import replaced
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
@@ -33,6 +33,6 @@ def write(source: Source, out: Path) -> Sequence[Path]:
 
     checked = compared(source, it, run)
     card = write_card(source, it, out, f"{checked} Platforms: {', '.join(PLATFORMS)}.")
-    with written_whole(out) as file:
+    with replaced(out) as file:
         file.write(data)
     return [out, card]

@@ -24,7 +24,7 @@ Shape: TypeAlias = Words | Float[jax.ShapeDtypeStruct, "E R N V"]
 
 
 def silence(agents: Sequence[int] | int | None = None) -> Intervention:
-    """Nobody hears these agents (or this one), counted from 0; by default nobody hears anybody."""
+    """Let nobody hear these agents (or this one), counted from 0; by default nobody hears anybody."""
     silenced = [] if agents is None else [_agent("silence", agent) for agent in np.atleast_1d(agents)]
 
     def init(words: Shape) -> Any:
@@ -43,7 +43,7 @@ def silence(agents: Sequence[int] | int | None = None) -> Intervention:
 
 
 def swap(one: int, other: int) -> Intervention:
-    """Each of the two agents is heard with the words of the other."""
+    """Let each of the two agents be heard with the words of the other."""
     one, other = _agent("swap", one), _agent("swap", other)
 
     def init(words: Shape) -> Any:
@@ -58,7 +58,7 @@ def swap(one: int, other: int) -> Intervention:
 
 
 def scramble() -> Intervention:
-    """Every agent is heard with its own words from the next of the episodes that are played side by side.
+    """Let every agent be heard with its own words from the next of the episodes that are played side by side.
 
     The words keep their frequencies and their order in time, and say nothing about what goes on here. Raises
     ConfigError for a single episode.
@@ -73,7 +73,7 @@ def scramble() -> Intervention:
 
 
 def drop(probability: float) -> Intervention:
-    """Each edge loses what is said along it in a step, all rounds of it, with this probability."""
+    """Let each edge lose what is said along it in a step, all rounds of it, with this probability."""
     probability = _share("drop", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -86,7 +86,7 @@ def drop(probability: float) -> Intervention:
 
 
 def noise(probability: float) -> Intervention:
-    """Each word is replaced by a symbol drawn at random with this probability."""
+    """Replace each word by a symbol drawn at random with this probability."""
     probability = _share("noise", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -172,7 +172,10 @@ def of(what: Any) -> Intervention | None:
 
 
 def arriving(what: Arrives) -> Intervention:
-    """The same words arrive at every step, and along the same edges: those of one environment, [R, N, V] and [N, N]."""
+    """Let the same words arrive at every step, and along the same edges.
+
+    They are those of one environment, [R, N, V] and [N, N].
+    """
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (first.shape[0], *leaf.shape)), what)

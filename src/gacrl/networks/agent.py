@@ -34,6 +34,8 @@ class AgentMemory(NamedTuple):
 
 
 class AgentOutput(NamedTuple):
+    """What the network gives for N agents in one step: A outputs, H features, R rounds of messages."""
+
     head: Float[Array, "N A"]
     hidden: Float[Array, "N H"]
     messages: Float[Array, "R N V"] | None
@@ -117,7 +119,7 @@ class AgentNetwork(eqx.Module):
         return output, AgentMemory(carry, inbox) if isinstance(memory, AgentMemory) else ()
 
     def see(self, observation: Observation, inbox: Any, key: PRNGKey | None) -> Seen:
-        """What comes before the memory: what is seen, its code, and what was heard of the step before."""
+        """Return what comes before the memory: what is seen, its code, and what was heard of the step before."""
         looked = self.torso(observation)
         hidden, code, code_loss = looked.hidden, None, 0.0
         if self.code is not None:
@@ -132,7 +134,7 @@ class AgentNetwork(eqx.Module):
         key: PRNGKey | None,
         temperature: Float[Array, ""] | float,
     ) -> tuple[AgentOutput, Any]:
-        """What comes after the memory: communication and head; and the inbox for the next step."""
+        """Return what comes after the memory: communication and head; and the inbox for the next step."""
         adjacency, near = self._around(observation)
         spoken = self.communication.speak(seen.hidden, near, key, temperature, seen.code)
         messages = spoken.messages
@@ -164,7 +166,8 @@ def unroll(
     keys: Key[Array, "T ..."] | None,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[AgentOutput, Memory]:
-    """The network over T steps of one environment [T, …], or of B [T, B, …]: outputs, and the memory *after* each step.
+    """Unroll the network over T steps of one environment [T, …], or of B [T, B, …]: outputs, and the memory *after*
+    each step.
 
     The memory starts anew where `first` [T, B], or [T, B, N] for each agent. What does not wait for the step before is
     computed for all steps at once. Time stays in front: mapping this over environments turns every array twice.
@@ -210,12 +213,12 @@ def words_said(network: AgentNetwork, env: Environment) -> tuple[int, ...] | Non
 
 
 def acting_parameters(env: Environment, config: NetworkConfig, num_outputs: int) -> int:
-    """How many parameters the network of these settings has."""
+    """Return how many parameters the network of these settings has."""
     return num_parameters(eqx.filter_eval_shape(AgentNetwork, env, config, num_outputs, jax.random.key(0)))
 
 
 def matched(env: Environment, config: NetworkConfig, num_outputs: int) -> NetworkConfig:
-    """The configuration with the width at which the network's parameters come nearest to those asked for."""
+    """Return the configuration with the width at which the network's parameters come nearest to those asked for."""
     wanted = config.parameters
     if wanted is None:
         return config

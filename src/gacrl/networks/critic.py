@@ -18,12 +18,12 @@ View = Literal["local", "central"]
 
 
 def global_state(observation: Observation) -> Float[Array, " S"]:
-    """What a central critic may know: the task's state, or all features side by side where it has none."""
+    """Return what a central critic may know: the task's state, or all features side by side where it has none."""
     return observation.features.reshape(-1) if observation.state is None else observation.state
 
 
 def team_mean(values: Float[Array, "N H"], observation: Observation) -> Float[Array, " H"]:
-    """Mean over the real agents."""
+    """Return the mean over the real agents."""
     mask = observation.agent_mask[:, None]
     return jnp.where(mask, values, 0.0).sum(0) / jnp.maximum(mask.sum(), 1)
 
@@ -68,8 +68,9 @@ class Critic(eqx.Module):
     def unroll(
         self, observations: Observation, first: Bool[Array, "T ..."], memory: Memory
     ) -> tuple[Float[Array, "T N"], Memory]:
-        """Values along T steps of one environment, and the memory after each step; it starts anew where `first` [T], or
-        [T, N] for each agent."""
+        """Return the values along T steps of one environment, and the memory after each step; it starts anew where
+        `first` [T], or [T, N] for each agent.
+        """
         hidden = jax.vmap(self._see)(observations)
         if self.memory is not None:
             memory = hidden = self.memory.unroll(hidden, first, memory)

@@ -39,7 +39,7 @@ class Encoder(eqx.Module):
 def sample_latent(
     mean: Float[Array, "*b"], log_variance: Float[Array, "*b"], noise: Float[Array, "*b"]
 ) -> Float[Array, "*b"]:
-    """Equation (3): z = μ + ε exp(½ log σ²), with ε the given standard normal noise."""
+    """Compute equation (3): z = μ + ε exp(½ log σ²), with ε the given standard normal noise."""
     return mean + noise * jnp.exp(0.5 * log_variance)
 
 

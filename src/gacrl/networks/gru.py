@@ -30,7 +30,7 @@ class Gru(eqx.Module):
         self.incoming, self.recurrent = (a, b, c), (d, e, f)
 
     def empty(self, num_agents: int) -> Float[Array, "N H"]:
-        """The memory of agents that remember nothing yet."""
+        """Make the memory of agents that remember nothing yet."""
         return jnp.zeros((num_agents, self.recurrent[0].bias.size))
 
     def __call__(self, x: Float[Array, "N H"], memory: Float[Array, "N H"]) -> Float[Array, "N H"]:
@@ -40,7 +40,8 @@ class Gru(eqx.Module):
     def unroll(
         self, x: Float[Array, "T *b N H"], first: Bool[Array, "T ..."], memory: Float[Array, "*b N H"]
     ) -> Float[Array, "T *b N H"]:
-        """The memory after each step; before one that is `first` [T, *b], or [T, *b, N] for each agent, it is empty.
+        """Return the memory after each step; before one that is `first` [T, *b], or [T, *b, N] for each agent, it is
+        empty.
 
         The inputs' products, which wait for nothing, are computed for all steps at once.
         """

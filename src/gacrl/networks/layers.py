@@ -56,7 +56,7 @@ class Score(eqx.Module):
 
 
 def rectified(x: Float[Array, "*b"], slope: float = 0.0) -> Float[Array, "*b"]:
-    """x where it is positive, else slope · x: a ReLU, or a leaky one (Maas et al. 2013)."""
+    """Return x where it is positive, else slope · x: a ReLU, or a leaky one (Maas et al. 2013)."""
     return jax.nn.leaky_relu(x, slope) if slope else jax.nn.relu(x)
 
 
@@ -91,7 +91,8 @@ def redrawn(network: Net, key: PRNGKey) -> Net:
     """Give the layers of a network their first numbers anew, all of them from one draw.
 
     A draw a layer, which is what their constructors make, is a loop a layer to compile: that was most of what makes a
-    training state. What is in no `Linear` and no `Score` stays as it is.
+    training state. What is in no `Linear` and no `Score` stays as it is: constants, and TarMAC's signatures, drawn by a
+    split of the same key. Another key for either would change the first numbers of stored runs.
     """
     nodes, tree = jax.tree.flatten(network, is_leaf=_is_layer)
     layers = [node for node in nodes if _is_layer(node)]
@@ -137,5 +138,5 @@ def _orthogonal(normal: Float[Array, "out in"]) -> Float[Array, "out in"]:
 
 
 def num_parameters(network: eqx.Module) -> int:
-    """How many numbers a network learns."""
+    """Return how many numbers a network learns."""
     return sum(leaf.size for leaf in jax.tree.leaves(network))

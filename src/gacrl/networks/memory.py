@@ -8,7 +8,7 @@ from gacrl.types import Memory
 
 
 def restarted(fresh: Memory, memory: Memory, begins: Bool[Array, "#N"] | Bool[Array, ""]) -> Memory:
-    """The memory of one environment, fresh where something begins: for all of it, or for some agents [N].
+    """Return the memory of one environment, fresh where something begins: for all of it, or for some agents [N].
 
     What belongs to the whole team (scalars) outlives an agent.
     """

@@ -14,7 +14,7 @@ def gumbel_softmax(
     straight_through: bool = False,
     axis: int = -1,
 ) -> Float[Array, "*b V"]:
-    """Equation (9): softmax((logits + Gumbel noise) / τ) over the axis of symbols (Jang et al. 2017).
+    """Compute equation (9): softmax((logits + Gumbel noise) / τ) over the axis of symbols (Jang et al. 2017).
 
     With `straight_through` the value is the one-hot of the largest entry and the gradient that of the soft
     sample.
@@ -26,7 +26,7 @@ def gumbel_softmax(
 
 
 def most_likely_symbol(logits: Float[Array, "*b V"], axis: int = -1) -> Float[Array, "*b V"]:
-    """The one-hot of the largest entry: the message when nothing is explored."""
+    """Return the one-hot of the largest entry: the message when nothing is explored."""
     return jax.nn.one_hot(logits.argmax(axis), logits.shape[axis], dtype=logits.dtype, axis=axis)
 
 

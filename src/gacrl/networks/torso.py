@@ -146,7 +146,7 @@ Torso: TypeAlias = MlpTorso | GraphTorso
 
 
 def make(env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None) -> Torso:
-    """The torso that the configuration names."""
+    """Make the torso that the configuration names."""
     return (GraphTorso if config.torso == "graph" else MlpTorso)(env, config, key, gain)
 
 

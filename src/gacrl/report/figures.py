@@ -80,7 +80,7 @@ class Look(NamedTuple):
 
 
 def looks(names: Sequence[str], kinds: Mapping[str, str] | None = None) -> dict[str, Look]:
-    """A look for each name, no two alike: a shade of its kind's colour; dash and marker go on from name to name.
+    """Return a look for each name, no two alike: a shade of its kind's colour; dash and marker go on from name to name.
 
     kinds: the algorithm of each name; without: its name in small letters. Where all are of one kind, colours tell the
     names apart, and the first keeps the kind's.
@@ -119,7 +119,7 @@ def curves(
     stopped: Collection[str] = (),
     begin: float | None = None,
 ) -> str:
-    """Lines with the band of their interval, thin ones for seeds, and a label where each line ends; SVG.
+    """Draw lines with the band of their interval, thin ones for seeds, and a label where each line ends; SVG.
 
     A cross marks where a seed ends before others of its line, and where a line ends that is in `stopped`. lines:
     heights to mark by name, such as what random and oracle get. styles: from `looks`; none: made for these names.
@@ -205,7 +205,7 @@ def dots(
     lines: Mapping[str, float] | None = None,
     styles: Mapping[str, Look] | None = None,
 ) -> str:
-    """A row for each name: every seed [S] as a dot, and under them the estimate (point, low, high); SVG.
+    """Draw a row for each name: every seed [S] as a dot, and under them the estimate (point, low, high); SVG.
 
     A name without an estimate has its dots alone, one without seeds the word "diverged". lines: places to mark by name,
     such as random and oracle. styles: from `looks`.
@@ -277,7 +277,7 @@ def paths(
     ylabel: str,
     styles: Mapping[str, Look] | None = None,
 ) -> str:
-    """For each name the way of each seed through a plane, x [P] and y [P], to a marker where it ends; SVG.
+    """Draw for each name the way of each seed through a plane, x [P] and y [P], to a marker where it ends; SVG.
 
     styles: from `looks`.
     """
@@ -304,7 +304,7 @@ def heat(
     columns: tuple[str, Sequence[str]],
     label: str,
 ) -> str:
-    """A grid of results [panels, rows, columns]: panels side by side, a number in every cell; SVG.
+    """Draw a grid of results [panels, rows, columns]: panels side by side, a number in every cell; SVG.
 
     panels, rows, columns: an axis's title and the labels along it. label: what is measured. NaN: an empty cell.
     """

@@ -37,7 +37,7 @@ def literal(text: str) -> str:
 
 
 def folded(text: str) -> str:
-    """The same on lines of _FOLDED letters at most."""
+    """Return the same on lines of _FOLDED letters at most."""
     return literal("\n".join(textwrap.wrap(text, _FOLDED, break_on_hyphens=False)) or text)
 
 
@@ -91,7 +91,7 @@ def _figure_of(axes: Axes) -> Figure:
 
 
 def spread(wanted: Sequence[float] | NDArray[Any], tall: NDArray[Any], low: float, high: float) -> NDArray[Any]:
-    """The middles [K] of K labels on a line: none on another, all between low and high where there is room.
+    """Return the middles [K] of K labels on a line: none on another, all between low and high where there is room.
 
     wanted: their middles as they should be. tall: their heights. Neighbours that would meet are moved as one block.
     """

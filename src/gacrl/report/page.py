@@ -5,7 +5,7 @@ The same content gives the same bytes. The HTML needs nothing else: figures and 
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,11 +124,9 @@ class _Table:
         )
 
     def as_markdown(self, figures: str) -> str:
-        lines = [self.columns, ("---",) * len(self.columns)]
-        table = [" | ".join(_plain(cell) for cell in row) for row in (lines[0], *self.rows)]
-        table.insert(1, " | ".join(lines[1]))
+        columns, *rows = [[_plain(cell) for cell in row] for row in (self.columns, *self.rows)]
         caption = f"{_paragraph(self.caption)}\n\n" if self.caption else ""
-        return caption + "\n".join(f"| {line} |" for line in table)
+        return caption + markdown_table(columns, rows)
 
 
 @dataclass(frozen=True)
@@ -163,13 +161,13 @@ class Page:
         self._blocks: list[_Heading | _Text | _Code | _Details | _Live | _Table | _Figure] = []
 
     def heading(self, text: str, level: int = 2) -> None:
-        """A heading of level 2 to 4; the title is level 1."""
+        """Add a heading of level 2 to 4; the title is level 1."""
         if not 2 <= level <= 4:
             raise ValueError(f"a heading has level 2 to 4, not {level}")
         self._blocks.append(_Heading(text, level))
 
     def text(self, paragraph: str) -> None:
-        """A paragraph."""
+        """Add a paragraph."""
         self._blocks.append(_Text(paragraph))
 
     def code(self, text: str) -> None:
@@ -177,25 +175,25 @@ class Page:
         self._blocks.append(_Code(text))
 
     def details(self, summary: str, text: str) -> None:
-        """A listing that is folded away under its summary."""
+        """Add a listing that is folded away under its summary."""
         self._blocks.append(_Details(summary, text))
 
     def live(self, style: str, script: str, data: Any, said: str) -> None:
-        """A part that a script of ours fills: the element `live`, from the data in `live-data`. One a page.
+        """Add a part that a script of ours fills: the element `live`, from the data in `live-data`. One a page.
 
         style, script: files of this package. said: what stands in Markdown instead.
         """
         self._blocks.append(_Live(style, script, embedded(data), said))
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> None:
-        """A table; every row has as many cells as there are columns. Raises ValueError for one that has not."""
+        """Add a table; every row has as many cells as there are columns. Raises ValueError for one that has not."""
         for row in rows:
             if len(row) != len(columns):
                 raise ValueError(f"a row has {len(row)} cells under {len(columns)} columns: {list(row)}")
         self._blocks.append(_Table(tuple(columns), tuple(map(tuple, rows)), caption))
 
     def figure(self, svg: str, caption: str, name: str) -> None:
-        """A figure. svg: the text of an SVG file; name: of its file beside the Markdown, without ending.
+        """Add a figure. svg: the text of an SVG file; name: of its file beside the Markdown, without ending.
 
         Raises ValueError for a name that is taken, or is more than letters, digits, - and _.
         """
@@ -208,7 +206,7 @@ class Page:
         self._blocks.append(_Figure(svg, caption, name))
 
     def html(self) -> str:
-        """The whole page as one HTML file."""
+        """Return the whole page as one HTML file."""
         title = html.escape(self.title)
         live = [block for block in self._blocks if isinstance(block, _Live)]
         scripts = " ".join(f"'{digest(block.script)}'" for block in live) or "'none'"
@@ -224,7 +222,7 @@ class Page:
         )
 
     def markdown(self, figures: str) -> str:
-        """The page as Markdown; figures: the folder of its SVG files, relative to it."""
+        """Return the page as Markdown; figures: the folder of its SVG files, relative to it."""
         return (
             "\n\n".join([f"# {_plain(self.title)}", *(block.as_markdown(figures) for block in self._blocks)])
             + "\n"
@@ -258,6 +256,12 @@ class Page:
 
     def _figures(self) -> list[_Figure]:
         return [block for block in self._blocks if isinstance(block, _Figure)]
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Write a table in Markdown, its cells as they are."""
+    lines = (columns, ["---"] * len(columns), *rows)
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
 
 
 def _plain(text: str) -> str:

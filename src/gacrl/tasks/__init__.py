@@ -52,7 +52,7 @@ _OWN: dict[str, Own] = {}
 
 
 def names() -> list[str]:
-    """The tasks that are at hand: ours first."""
+    """Return the tasks that are at hand: ours first."""
     return [*_OURS, *_OWN]
 
 
@@ -64,12 +64,12 @@ def bring(own: Own) -> None:
 
 
 def brought(name: str) -> Own | None:
-    """A task from outside; None for one of ours, or one that is not at hand."""
+    """Return a task from outside; None for one of ours, or one that is not at hand."""
     return _OWN.get(name)
 
 
 def find(name: str) -> Task:
-    """The task of that name. Raises ConfigError with the nearest name where it is not at hand."""
+    """Return the task of that name. Raises ConfigError with the nearest name where it is not at hand."""
     if name in _OURS:
         folder, _, record = _OURS[name]
         return getattr(import_module(f"{folder}.task"), record)
@@ -78,7 +78,7 @@ def find(name: str) -> Task:
 
 
 def default_settings(name: str) -> Any:
-    """The settings of that task as they stand where nothing is said. Raises ConfigError."""
+    """Return the settings of that task as they stand where nothing is said. Raises ConfigError."""
     if name in _OURS:
         folder, kind, _ = _OURS[name]
         return getattr(import_module(f"{folder}.settings"), kind)()
@@ -87,7 +87,9 @@ def default_settings(name: str) -> Any:
 
 
 def ours(settings: Any) -> tuple[str, Any] | None:
-    """The name and settings of one of our tasks, from its settings or its environment; None for anything else."""
+    """Return the name and settings of one of our tasks, from its settings or its environment; None for anything
+    else.
+    """
     kinds = {name: type(default_settings(name)) for name in _OURS}
     matching = [name for name, kind in kinds.items() if isinstance(settings, kind)]
     if not matching:
@@ -97,7 +99,7 @@ def ours(settings: Any) -> tuple[str, Any] | None:
 
 
 def flag(name: str, as_given: bool = False) -> str:
-    """What a command needs besides to find this task again: nothing for the default one.
+    """Return what a command needs besides to find this task again: nothing for the default one.
 
     as_given: with its file as it was named, for a page that others read.
     """

@@ -160,7 +160,7 @@ def _default(kind: type, name: str) -> Any:
 
 @contextlib.contextmanager
 def blamed(source: Path | None) -> Generator[None]:
-    """Raises ConfigError, with file, line and message, for what code of that file raises."""
+    """Raise ConfigError, with file, line and message, for what code of that file raises."""
     file = None if source is None else source.resolve()
     try:
         yield
@@ -180,7 +180,7 @@ def blamed(source: Path | None) -> Generator[None]:
 
 
 def examine(own: Own) -> None:
-    """Raises ConfigError for a task that does not keep its word: sizes, shapes, kinds of numbers, names of measures.
+    """Raise ConfigError for a task that does not keep its word: sizes, shapes, kinds of numbers, names of measures.
 
     Nothing is computed, except for one reset and step of what can be.
     """

@@ -32,6 +32,11 @@ class Metric(NamedTuple):
     defined_by: tuple[str, ...] = ()
     """Settings of the task that define it: where they differ it cannot be compared."""
 
+    @property
+    def sign(self) -> float:
+        """What makes more of it better: 1 or −1."""
+        return 1.0 if self.higher_is_better else -1.0
+
 
 class Words(NamedTuple):
     """What a picture calls the things in it."""
@@ -77,22 +82,22 @@ class Case(NamedTuple):
 
 
 def no_params(settings: Settings, gamma: float, padded: bool) -> EnvParams:
-    """Nothing about the task is a number that could change between steps."""
+    """Return no numbers: nothing about the task could change between steps."""
     return ()
 
 
 def unchanged(settings: Settings, params: EnvParams, share: Any) -> EnvParams:
-    """The task is as difficult at the start as at the end."""
+    """Return the numbers as they are: the task is as difficult at the start as at the end."""
     return params
 
 
 def complete(settings: Settings) -> bool:
-    """All agents are there from an episode's start to its end."""
+    """Say that all agents are there from an episode's start to its end."""
     return False
 
 
 def unnamed(settings: Settings) -> Sequence[str]:
-    """The task does not say what its actions are called."""
+    """Return no names: the task does not say what its actions are called."""
     return ()
 
 
@@ -165,13 +170,15 @@ class Task(NamedTuple):
     """One line on what must be done, for `gacrl tasks`."""
 
     def metric(self, name: str) -> Metric:
-        """The metric of that name; of a `score_` that of the number which it scales, and of a bare measure its mean."""
+        """Return the metric of that name; of a `score_` that of the number which it scales, and of a bare measure its
+        mean.
+        """
         plain = name.removeprefix("score_")
         found = self.metrics.get(plain) or RETURN.get(plain) or Metric(plain)
         return found._replace(higher_is_better=True) if plain != name else found
 
     def shown(self, measured: Sequence[str]) -> dict[str, str]:
-        """The metrics of tables among those that are measured, headline first, and what they are called there.
+        """Return the metrics of tables among those that are measured, headline first, and what they are called there.
 
         Of a task that defines no metrics all are shown.
         """
@@ -182,17 +189,17 @@ class Task(NamedTuple):
         return {name: label for name, label in labels.items() if name in measured}
 
     def numbers(self, settings: Settings, env: Any, gamma: float = 1.0, padded: bool = False) -> EnvParams:
-        """What `params` says; where the record says nothing, what the environment has."""
+        """Return what `params` says; where the record says nothing, what the environment has."""
         return env.default_params() if self.params is no_params else self.params(settings, gamma, padded)
 
     def with_horizon(self, settings: Settings, steps: int) -> Settings:
-        """The settings with episodes of so many steps. Raises ConfigError where the task has a fixed length."""
+        """Return the settings with episodes of so many steps. Raises ConfigError where the task has a fixed length."""
         if "max_cycles" not in {field.name for field in fields(settings)}:
             raise ConfigError(f"{self.name} has no setting max_cycles: its episodes have a length of their own")
         return replace(settings, max_cycles=steps)
 
     def facts(self, settings: Settings, measured: Sequence[str]) -> dict[str, Any]:
-        """What a comparison must know of the task as it is set, as plain data: it stands in every summary.
+        """Return what a comparison must know of the task as it is set, as plain data: it stands in every summary.
 
         measured: the names of the metrics that episodes have.
         """

@@ -100,7 +100,9 @@ def prepare(ahead: Ahead, trainer: AbstractTrainer, config: RunConfig, fresh: bo
 
 
 def closing(trainer: Trainer, config: RunConfig) -> tuple[Lower, ...]:
-    """The programs that close a run: its two evaluations, and the episodes of a seed to look at, a function of it."""
+    """Return the programs that close a run: its two evaluations, and the episodes of a seed to look at, a function of
+    it.
+    """
     learner, count = _laid_out(trainer).learner, config.evaluation.final_episodes
     first = _placed(member_shapes(trainer).learner, SingleDeviceSharding(jax.local_devices()[0]))
     return (

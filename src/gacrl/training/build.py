@@ -53,7 +53,7 @@ def make_trainer(
     learns: bool = True,
     intervention: Intervention | None = None,
 ) -> AbstractTrainer:
-    """The compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`.
+    """Make the compiled functions that train this configuration; on these devices, of the axes `seeds` and `envs`.
 
     learns: False for policies that are only played: the task then does not move. intervention: what happens to their
     messages; by default what the settings say. Raises ConfigError for settings that do not fit each other.
@@ -98,7 +98,7 @@ def _over(crew: Crew, env: Environment, task: Task) -> Hosted:
 
 
 def make_algorithm(config: RunConfig) -> Algorithm:
-    """The algorithm for the shapes of the task. Raises ConfigError for a task that it cannot play."""
+    """Make the algorithm for the shapes of the task. Raises ConfigError for a task that it cannot play."""
     task = tasks.find(config.task)
     require(
         not (getattr(config.algorithm, "fixed_team", False) and task.ragged(config.env)),
@@ -109,13 +109,13 @@ def make_algorithm(config: RunConfig) -> Algorithm:
 
 
 def mesh(config: RunConfig, algorithm: Algorithm | None = None) -> Mesh:
-    """The devices that train this configuration: some algorithms learn from environments spread over several."""
+    """Return the devices that train this configuration: some algorithms learn from environments spread over several."""
     algorithm = make_algorithm(config) if algorithm is None else algorithm
     return mesh_for(config.num_seeds, config.training.num_envs if algorithm.splits_envs else None)
 
 
 def evaluated_settings(config: RunConfig) -> Any:
-    """The task as it is evaluated: with the evaluation's own horizon, where it has one."""
+    """Return the task as it is evaluated: with the evaluation's own horizon, where it has one."""
     task: Task = tasks.find(config.task)
     horizon = config.evaluation.horizon
     return config.env if horizon is None else task.with_horizon(config.env, horizon)
@@ -153,17 +153,20 @@ def _notes(config: RunConfig) -> Iterator[str]:
 
 
 def member_shapes(trainer: AbstractTrainer) -> TrainState:
-    """The shapes of a seed's training state."""
+    """Return the shapes of a seed's training state."""
     return jax.eval_shape(lambda: trainer.init_member(jax.random.key(0), trainer.algorithm.hyper))
 
 
 def stacked_shapes(trainer: AbstractTrainer, num_seeds: int | None = None) -> TrainState:
-    """The shapes of the training state of all seeds, as a checkpoint holds it; or of so many."""
+    """Return the shapes of the training state of all seeds, as a checkpoint holds it; or of so many."""
     return _stacked(member_shapes(trainer), trainer.num_seeds if num_seeds is None else num_seeds)
 
 
 def learner_shapes(trainer: AbstractTrainer) -> Learner:
-    """The shapes of the learners of all seeds. Environments, and what happens to messages in them, do not matter."""
+    """Return the shapes of the learners of all seeds.
+
+    Environments, and what happens to messages in them, do not matter.
+    """
     algorithm = trainer.algorithm
     return _stacked(jax.eval_shape(lambda: algorithm.init(jax.random.key(0), algorithm.hyper)), trainer.num_seeds)
 

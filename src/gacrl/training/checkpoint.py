@@ -49,7 +49,7 @@ class Checkpoint(NamedTuple):
 
 
 def arrays(state: PyTree, replay: Replay[Any] | None = None) -> dict[str, np.ndarray]:
-    """A state's leaves on the host, by their paths. They may be views: use them before the state is donated.
+    """Return a state's leaves on the host, by their paths. They may be views: use them before the state is donated.
 
     replay: the part of it that remembers, stacked over the seeds, [seeds, rows, …]. It is cut to the rows that are
     filled; the others are zeros, and `load` makes them again.
@@ -72,7 +72,7 @@ def _ids(replay: Replay[Any] | None) -> set[int]:
 
 
 def serialise(named: Mapping[str, np.ndarray]) -> bytes:
-    """The file of these arrays: a copy, which no later step of the training changes."""
+    """Return the file of these arrays: a copy, which no later step of the training changes."""
     return safetensors.numpy.save(dict(named))
 
 
@@ -113,7 +113,7 @@ def save(
 
 
 def newest(folder: Path, kind: str = STEP) -> tuple[Checkpoint, list[str]]:
-    """The newest intact checkpoint, and a sentence for each damaged one that was passed over.
+    """Return the newest intact checkpoint, and a sentence for each damaged one that was passed over.
 
     Raises UserError when there is none.
     """
@@ -146,7 +146,7 @@ def set_aside_damaged(folder: Path, kind: str = STEP) -> list[Path]:
 
 
 def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", replay: Replay[Any] | None = None) -> Tree:
-    """The saved state in the structure of `like` (arrays or their shapes).
+    """Load the saved state in the structure of `like` (arrays or their shapes).
 
     prefix: the path of `like` inside the saved state, such as `.learner`. replay: the part of `like` that remembers,
     of which the empty rows were not saved. Numbers take the precision of `like`, whatever JAX computed with when they

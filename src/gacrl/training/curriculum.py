@@ -19,6 +19,8 @@ Advance: TypeAlias = Callable[[CurriculumState, Int[Array, ""], Rollout], tuple[
 
 
 class Curriculum(NamedTuple):
+    """How a task changes while it is learned."""
+
     init: Callable[[EnvParams], tuple[CurriculumState, EnvParams]]
     """The task as configured -> (state, the parameters of the task to begin with)."""
     advance: Advance
@@ -40,12 +42,12 @@ _MEMORY = 0.05
 
 
 def constant() -> Curriculum:
-    """The task stays as it is."""
+    """Leave the task as it is."""
     return Curriculum(lambda params: (params, params), lambda params, env_steps, rollout: (params, params))
 
 
 def linear(config: CurriculumConfig, task: Task, settings: Any) -> Curriculum:
-    """The task's difficulty goes from 0 to 1 over the episodes that count, once an episode."""
+    """Raise the task's difficulty from 0 to 1 over the episodes that count, once an episode."""
 
     def params_at(stage: Stage) -> EnvParams:
         return task.difficulty(settings, stage.base, jnp.minimum(stage.episode / config.episodes, 1.0))
@@ -69,7 +71,7 @@ def linear(config: CurriculumConfig, task: Task, settings: Any) -> Curriculum:
 
 
 def make(config: CurriculumConfig, task: Task, settings: Any, params: EnvParams) -> Curriculum:
-    """The curriculum that settings of the run and of the task ask for.
+    """Make the curriculum that settings of the run and of the task ask for.
 
     Raises ConfigError for a gate where nothing moves, or where the task does not say what progress is.
     """

@@ -79,7 +79,7 @@ def release_memory() -> None:
 
 
 def mesh_for(num_seeds: int, num_envs: int | None = None) -> Mesh:
-    """The devices of all processes, as many as can be kept busy, with the axes `seeds` and `envs`.
+    """Return the devices of all processes, as many as can be kept busy, with the axes `seeds` and `envs`.
 
     num_envs: environments of a seed, where the algorithm can learn from a share of them on each device; one process
     on a CPU leaves them together. Raises UserError where some process would have nothing to do.
@@ -124,7 +124,7 @@ def stack_seeds(members: list[PyTree]) -> PyTree:
 
 
 def shard_seeds(stacked: PyTree, mesh: Mesh) -> PyTree:
-    """A stacked pytree laid out on the devices; with several processes each has the whole of it to begin with.
+    """Return a stacked pytree laid out on the devices; with several processes each has the whole of it to begin with.
 
     Where the seeds do not fill the devices evenly the last one is repeated: computed, never looked at.
     """
@@ -158,7 +158,7 @@ def _split(stacked: PyTree, parts: int) -> list[PyTree]:
 
 
 def gathered(tree: PyTree) -> PyTree:
-    """What is spread over several processes, whole in each of them; all must call it. Anything else as it is."""
+    """Gather a tree that is spread over several processes; every process must call this. Others stay as they are."""
     if jax.process_count() == 1:
         return tree
     wait_for_all()
@@ -173,12 +173,12 @@ def _gathering(mesh: Mesh) -> Callable[[PyTree], PyTree]:
 
 
 def leads() -> bool:
-    """Whether this process writes: one of several does."""
+    """Return whether this process writes: one of several does."""
     return jax.process_index() == 0
 
 
 def anyone(yes: bool) -> bool:
-    """Whether any of the processes says yes; all must ask."""
+    """Return whether any of the processes says yes; all must ask."""
     return yes if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.asarray(yes)).any())
 
 
@@ -192,24 +192,24 @@ def wait_for_all() -> None:
 
 
 def same_everywhere(number: int) -> bool:
-    """Whether all processes have the same number; all must ask, and none goes on before all have."""
+    """Return whether all processes have the same number; all must ask, and none goes on before all have."""
     if jax.process_count() == 1:
         return True
     return len(set(multihost_utils.process_allgather(np.asarray(number)).tolist())) == 1
 
 
 def one_seed(stacked: PyTree, member: int) -> PyTree:
-    """A single seed of a stacked pytree, on one device."""
+    """Return a single seed of a stacked pytree, on one device."""
     return _only(rows(stacked, member, member + 1))
 
 
 def without_padding(stacked: PyTree, num_seeds: int) -> PyTree:
-    """The real seeds of a sharded pytree, on one device."""
+    """Return the real seeds of a sharded pytree, on one device."""
     return rows(stacked, 0, num_seeds)
 
 
 def rows(stacked: PyTree, start: int, stop: int) -> PyTree:
-    """The seeds from `start` up to `stop` of a sharded pytree, on one device, fetched shard by shard.
+    """Return the seeds from `start` up to `stop` of a sharded pytree, on one device, fetched shard by shard.
 
     Indexing the sharded arrays themselves would make their devices wait for each other, and XLA ends the process
     when one of them, on a busy machine, is late by 40 seconds.

@@ -31,7 +31,7 @@ _VERDICT_SECONDS = 3.0
 def find_place(
     coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None
 ) -> Place:
-    """Which process this is: from what is given, else JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
+    """Find which process this is: from what is given, else JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and
     JAX_PROCESS_ID, else what SLURM, Open MPI, Kubernetes or a TPU pod say. Raises UserError.
     """
     coordinator = coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")

@@ -22,7 +22,8 @@ def not_finite(
     learners: Learner,
     replay: Replay[Any] | None = None,
 ) -> Iterator[tuple[int, str, str]]:
-    """The seed, name and value of whatever is NaN or infinite: what the updates told of each seed, then its learner.
+    """Return the seed, name and value of whatever is NaN or infinite: what the updates told of each seed, then its
+    learner.
 
     learners: stacked over the seeds; gradients show in the optimiser's moments. replay: the part of them that
     remembers, which is not looked at: it is most of a learner, and what is wrong there shows in the loss.
@@ -44,7 +45,7 @@ def not_finite(
 
 
 def require_sound_task(seeds: Sequence[int], task: str, fault: Any) -> None:
-    """Raises Faulty with the first number of the task that was not finite. fault: as in a chunk's report, [S]."""
+    """Raise Faulty with the first number of the task that was not finite. fault: as in a chunk's report, [S]."""
     if fault is None:
         return
     for seed, step, agent, reward in zip(seeds, *map(np.asarray, fault), strict=False):
@@ -64,7 +65,7 @@ def require_finite(
     before: int,
     after: int,
 ) -> None:
-    """Raises Diverged with the first quantity that is not finite.
+    """Raise Diverged with the first quantity that is not finite.
 
     before, after: the environment steps between which it happened.
     """

@@ -24,12 +24,12 @@ the file of a group's limit."""
 
 
 def size(tree: PyTree) -> int:
-    """Bytes of arrays, or of their shapes."""
+    """Return the bytes of arrays, or of their shapes."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def working_bytes(config: RunConfig, algorithm: Algorithm, member: TrainState) -> int:
-    """What a seed's chunk or evaluation holds at once besides its state, at the least.
+    """Return what a seed's chunk or evaluation holds at once besides its state, at the least.
 
     member: a seed's training state, or its shapes. Counted are a rollout (every step's observation, before and after),
     the episodes of an evaluation, and the batch of a gradient step; not what XLA puts between them.
@@ -42,12 +42,14 @@ def working_bytes(config: RunConfig, algorithm: Algorithm, member: TrainState) -
 
 
 def playing_bytes(env: Environment, params: EnvParams, memory: Memory, num_episodes: int) -> int:
-    """What episodes that are played side by side hold at once, at the least: states, observations and memories."""
+    """Return what episodes that are played side by side hold at once, at the least: states, observations and
+    memories.
+    """
     return size(jax.eval_shape(lambda: rollouts.start(env, params, memory, jax.random.key(0), num_episodes)))
 
 
 def recording_bytes(env: Environment, params: EnvParams, num_episodes: int, look: Look | None) -> int:
-    """What episodes that are kept hold at once, at the least: as they are played, and as they are handed out."""
+    """Return what episodes that are kept hold at once, at the least: as they are played, and as they are handed out."""
     return 2 * recorded_bytes(env, params, num_episodes, look)
 
 
@@ -57,7 +59,7 @@ def require_room(
     what: str = "this run needs",
     mend: str = "take fewer seeds, environments or agents, or a smaller replay or network",
 ) -> None:
-    """Raises UserError, with both numbers, for something that this machine has not the memory for."""
+    """Raise UserError, with both numbers, for something that this machine has not the memory for."""
     there = memory_of(device)
     if there is not None and needed > there:
         raise UserError(
@@ -67,14 +69,15 @@ def require_room(
 
 
 def require_room_to_play(needed: int) -> None:
-    """Raises UserError, with both numbers, for episodes that this machine has not the memory to play."""
+    """Raise UserError, with both numbers, for episodes that this machine has not the memory to play."""
     mend = "take fewer or shorter episodes, or fewer agents"
     require_room(needed, jax.local_devices()[0], "to play these episodes takes", mend)
 
 
 def memory_of(device: Any) -> int | None:
-    """Bytes of an accelerator's memory, or of the machine's (what the process may have, where that is less); None:
-    not known."""
+    """Return the bytes of an accelerator's memory, or of the machine's (what the process may have, where that is less);
+    None: not known.
+    """
     if device.platform != "cpu":
         return (device.memory_stats() or {}).get("bytes_limit")
     try:
@@ -109,7 +112,7 @@ def _limits() -> Iterator[int]:
 
 
 def readable(count: int) -> str:
-    """Bytes in words: 1.5 GiB."""
+    """Write bytes in words: 1.5 GiB."""
     units = ("KiB", "MiB", "GiB", "TiB", "PiB", "EiB", "ZiB", "YiB")
     amount, unit = count / 1024, 0
     while amount >= 1024 and unit < len(units) - 1:

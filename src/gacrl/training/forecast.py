@@ -7,7 +7,7 @@ _SECONDS_A_FRAME = 0.006
 
 
 def closing_seconds(playing: float, more_episodes: float, frames: int) -> float:
-    """What is still to come after the last chunk; its programs are compiled by then.
+    """Return what is still to come after the last chunk; its programs are compiled by then.
 
     playing: seconds that the evaluations along the way take. more_episodes: how many times as many the closing
     evaluations have. frames: of all pictures.

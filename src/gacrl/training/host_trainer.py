@@ -148,7 +148,7 @@ class HostTrainer(AbstractTrainer):
     def evaluate(
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[np.ndarray, "S K"]]:
-        """The metrics of K fixed episodes of each seed's learner, one learner after the other."""
+        """Measure K fixed episodes of each seed's learner, one learner after the other."""
         assert isinstance(self.evaluation_env, Hosted)
         played: list[dict[str, np.ndarray]] = []
         for member in range(self.num_seeds):

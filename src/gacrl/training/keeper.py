@@ -48,7 +48,7 @@ class Keeper:
         self._save = partial(checkpoint.save, folder.checkpoints, fingerprint=fingerprint)
         self._writing = partial(folder.writing, task.name)
         self._headline = task.headline
-        self._sign = 1.0 if task.metric(task.headline).higher_is_better else -1.0
+        self._sign = task.metric(task.headline).sign
         self._best = self._kept_score(folder.checkpoints)
 
     def __call__(self, progress: Progress) -> None:

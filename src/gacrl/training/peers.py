@@ -52,7 +52,7 @@ class Line:
             self._connection.sendall((json.dumps(words) + "\n").encode())
 
     def hear(self, seconds: float | None = None) -> dict[str, Any] | None:
-        """What comes next; None when the line is dead, says nothing in this time, or speaks another language."""
+        """Return what comes next; None when the line is dead, says nothing in this time, or speaks another language."""
         try:
             self._connection.settimeout(seconds)
             words = json.loads(self._reader.readline())
@@ -86,7 +86,7 @@ class Peers:
         self._say(mend=mend)
 
     def leave(self) -> None:
-        """This process has done its part. Process 0 goes when the others have heard so, the others when it has.
+        """Leave, this process having done its part: process 0 when the others have heard so, the others when it has.
 
         A line that closes with something unread resets, and what its other end had not read yet is lost.
         """

@@ -19,6 +19,8 @@ from gacrl.types import Learner
 
 
 class ProbeResult(NamedTuple):
+    """What an algorithm learned on the probes, by their names."""
+
     returns: dict[str, float]
     """Greedy return of each probe."""
     values: dict[str, tuple[float, float]]

@@ -16,6 +16,7 @@ from gacrl.config import files as configuration
 from gacrl.config.presets import label
 from gacrl.config.run import RunConfig
 from gacrl.errors import ConfigError, UserError, reason
+from gacrl.replacing import replace_json, replace_text
 from gacrl.versions import version, versions
 
 SHOWN_EPISODES = 4
@@ -40,7 +41,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path | None, config: RunConfig, begun_from: str | None = None) -> "RunFolder":
-        """A new run folder. Without a path: the next free number under `runs/`.
+        """Make a new run folder. Without a path: the next free number under `runs/`.
 
         begun_from: the run whose policy this one starts with. Raises UserError where the path exists already, or cannot
         be written.
@@ -57,8 +58,8 @@ class RunFolder:
             folder = cls(path)
             folder.checkpoints.mkdir()
             folder.episodes.mkdir()
-            folder._replace(folder.origin_file, json.dumps(_origin(config, begun_from), indent=2) + "\n")
-            folder._replace(folder.config_file, configuration.dumps(config))
+            replace_json(folder.origin_file, _origin(config, begun_from))
+            replace_text(folder.config_file, configuration.dumps(config))
             folder.metrics_file.touch()
         except OSError as error:
             raise UserError(
@@ -68,7 +69,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run folder. Raises UserError where there is none."""
+        """Open an existing run folder. Raises UserError where there is none."""
         if not path.exists():
             raise UserError(f"there is no run {path}: `gacrl train` makes one and prints where it is")
         if not _is_run(path):
@@ -86,7 +87,7 @@ class RunFolder:
                 raise UserError(f"{path} is a {found}, and stands where a {wanted} belongs: move it away")
 
     def config(self) -> RunConfig:
-        """The settings that the run was started with. Raises UserError, also for a task that is not at hand."""
+        """Read the settings that the run was started with. Raises UserError, also for a task that is not at hand."""
         try:
             return configuration.load(self.config_file)
         except ConfigError as error:
@@ -136,7 +137,7 @@ class RunFolder:
             warn(f"{source} has changed since {self.path} was made: the task is played as it is now")
 
     def settings(self) -> dict[str, Any]:
-        """The same as they stand in the file: a version that knows more settings does not add to them."""
+        """Return the same as they stand in the file: a version that knows more settings does not add to them."""
         self.config()  # refuses what is no configuration
         return json.loads(self.config_file.read_text(encoding="utf-8"))
 
@@ -179,7 +180,7 @@ class RunFolder:
             os.fsync(file.fileno())
 
     def metrics(self) -> list[dict[str, Any]]:
-        """Every row that was written; a last line that a crash cut off is left out.
+        """Return every row that was written; a last line that a crash cut off is left out.
 
         Raises UserError for a damaged line before the last, by its number.
         """
@@ -200,25 +201,25 @@ class RunFolder:
         """Drop the rows past a checkpoint, which the resumed run writes again; returns how many stay."""
         rows = self.metrics() if self.metrics_file.exists() else []
         rows = [row for row in rows if row["env_steps"] <= env_steps]
-        self._replace(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+        replace_text(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
         return len(rows)
 
     def extend(self, env_steps: int) -> None:
         """Set the planned environment steps anew; every other setting stays as it stands in the file."""
         settings = self.settings()
         settings["training"] = {**settings.get("training", {}), "env_steps": env_steps}
-        self._replace(self.config_file, json.dumps(settings, indent=2) + "\n")
+        replace_json(self.config_file, settings)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Replace `summary.json`."""
-        self._replace(self.summary_file, json.dumps(summary, indent=2) + "\n")
+        replace_json(self.summary_file, summary)
 
     def write_diverged(self, because: str) -> None:
         """Say in `diverged.json` that the run ended so."""
-        self._replace(self.diverged_file, json.dumps({"because": because}) + "\n")
+        replace_json(self.diverged_file, {"because": because}, indent=None)
 
     def why_diverged(self) -> str | None:
-        """Why the run diverged; None where it did not. Raises UserError for a damaged file."""
+        """Return why the run diverged; None where it did not. Raises UserError for a damaged file."""
         if not self.diverged_file.is_file():
             return None
         try:
@@ -228,19 +229,9 @@ class RunFolder:
                 f"{self.diverged_file} is damaged: remove it, and `gacrl resume {self.path}` finds out again"
             ) from error
 
-    def _replace(self, path: Path, text: str) -> None:
-        """Write a whole file so that a reader sees the old one or the new one, never half of it."""
-        unfinished = path.with_name(f".{path.name}.unfinished")
-        unfinished.unlink(missing_ok=True)  # by a process that was killed; or a link, which must lead nobody away
-        with unfinished.open("x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
-
 
 def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
-    """The command that goes on with a run, to copy: whatever its folder is called."""
+    """Return the command that goes on with a run, to copy: whatever its folder is called."""
     return f"gacrl resume {shlex.quote(str(path))}{tasks.flag(task)}"
 
 

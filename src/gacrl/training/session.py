@@ -86,7 +86,7 @@ def start(
 
 
 def begin_with(trainer: AbstractTrainer, config: RunConfig, parent: Parent) -> TrainState:
-    """A fresh training state, stacked, with what the parent has learned."""
+    """Make a fresh training state, stacked, with what the parent has learned."""
     state, algorithm = trainer.init_stacked(config.seeds), trainer.algorithm
     like = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((parent.num_seeds, *leaf.shape), leaf.dtype),
@@ -140,7 +140,7 @@ def resume(path: Path, extend: SupportsIndex | None = None, watcher: Watcher | N
 
 
 def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
-    """Where a run can go on: at its newest intact checkpoint; None where it has not come to one yet.
+    """Return where a run can go on: at its newest intact checkpoint; None where it has not come to one yet.
 
     Raises UserError for checkpoints that are all damaged or gone, or of other settings.
     """
@@ -163,7 +163,7 @@ def newest_checkpoint(folder: RunFolder, warn: Callable[[str], None]) -> checkpo
 
 
 def restore(trainer: AbstractTrainer, config: RunConfig, found: checkpoint.Checkpoint | None) -> TrainState:
-    """The training state of a checkpoint, laid out on the devices; a fresh one without."""
+    """Restore the training state of a checkpoint, laid out on the devices; a fresh one without."""
     if found is None:
         return trainer.init(config.seeds)
     shapes = stacked_shapes(trainer)
@@ -341,7 +341,7 @@ def _show(folder: RunFolder, config: RunConfig, shown: list[episodes.Episode]) -
 
 
 def load_learners(found: checkpoint.Checkpoint, trainer: AbstractTrainer) -> Learner:
-    """The learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
+    """Load the learners of a checkpoint, stacked and laid out for the trainer: to act with, not to learn on."""
     shapes = trainer.algorithm.acting(learner_shapes(trainer))
     learners = checkpoint.load(found, shapes, prefix=".learner")
     return shard_seeds(learners, trainer.mesh)

@@ -62,7 +62,7 @@ class Fault(NamedTuple):
 
 
 def find_fault(steps: Transition, updates: Int[Array, ""]) -> Fault:
-    """The first fault of a rollout [T, E, …], after so many updates."""
+    """Return the first fault of a rollout [T, E, …], after so many updates."""
     seen = ~jnp.isfinite(steps.observation.features).all(-1)
     earned = ~jnp.isfinite(steps.reward)
     bad = jnp.stack([seen, earned], -1)  # [T E N 2]
@@ -73,7 +73,7 @@ def find_fault(steps: Transition, updates: Int[Array, ""]) -> Fault:
 
 
 def earlier(first: Fault | None, fault: Fault | None) -> Fault | None:
-    """The first of two faults, one after the other; None where nobody looks."""
+    """Return the first of two faults, one after the other; None where nobody looks."""
     if first is None or fault is None:
         return None
     known = first.step > 0
@@ -162,12 +162,12 @@ class AbstractTrainer(ABC):
         return shard_seeds(self.init_stacked(seeds), self.mesh)
 
     def init_stacked(self, seeds: tuple[int, ...]) -> TrainState:
-        """The same, not yet laid out on the devices."""
+        """Return the same, not yet laid out on the devices."""
         keys = [stream_key("training", seed) for seed in seeds]
         return stack_seeds([self.init_member(key, self.algorithm.hyper) for key in keys])
 
     def init_member(self, key: Key[Array, ""], hyper: Hyper, params: EnvParams | None = None) -> TrainState:
-        """A fresh training state of one seed, with these hyperparameters in this task."""
+        """Return a fresh training state of one seed, with these hyperparameters in this task."""
         return self._init(key, hyper, self.params if params is None else params)
 
     def lower_init(self, seed: int) -> Any:
@@ -203,7 +203,7 @@ class AbstractTrainer(ABC):
 
     @abstractmethod
     def evaluate(self, learners: Learner, explore: bool, stream: Stream, num_episodes: int) -> dict[str, Any]:
-        """The metrics of K fixed episodes of each seed's learner, [S, K], in the evaluation's task."""
+        """Measure K fixed episodes of each seed's learner, [S, K], in the evaluation's task."""
 
     def close(self) -> None:  # noqa: B027 nothing is open where environments are compiled
         """Let go of what is open."""
@@ -247,7 +247,7 @@ class AbstractTrainer(ABC):
         return tally, sum_up(episodes, inputs[1])
 
     def none_yet(self, state: TrainState, update: Any) -> Running:
-        """A chunk before its first update, given the shapes of an `Update`."""
+        """Return a chunk before its first update, given the shapes of an `Update`."""
         _, _, *shapes = update
         zeros, unseen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return Running(state, no_episodes(self.table), zeros, state.env_params, unseen)
@@ -267,7 +267,7 @@ def follow(running: Running, update: Update) -> Running:
 
 
 def closed(running: Running, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
-    """The state after a chunk, and what the chunk showed."""
+    """Return the state after a chunk, and what the chunk showed."""
     metrics = jax.tree.map(lambda total: total / jnp.maximum(num_updates, 1), running.totals)
     return running.state, ChunkReport(running.seen, metrics, running.used, running.fault)
 
@@ -316,7 +316,7 @@ class Trainer(AbstractTrainer):
     def evaluate(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, learners: Learner, explore: bool, stream: Stream, num_episodes: int
     ) -> dict[str, Float[Array, "S K"]]:
-        """The metrics of K fixed episodes of each seed's learner, in the evaluation's task."""
+        """Measure K fixed episodes of each seed's learner, in the evaluation's task."""
         env, params = self.evaluation_env, self.evaluation_params
 
         def one(learner: Learner) -> dict[str, Float[Array, " K"]]:

@@ -12,7 +12,7 @@ from gacrl.versions import versions
 
 
 def played_again(run: Finished, horizon: int, warn: Warn) -> Finished:
-    """The run with the closing evaluation that `gacrl evaluate RUN --horizon` makes: same policies, same starts.
+    """Return the run with the closing evaluation that `gacrl evaluate RUN --horizon` makes: same policies, same starts.
 
     It has as many episodes as its own, and no evaluations along the way: those were over another horizon. Raises
     ConfigError for a task whose episodes have a length of their own.

@@ -123,17 +123,17 @@ class Comparison:
     """What a reader must know before believing it, a sentence each."""
 
     def reference(self, who: str, metric: str) -> float:
-        """What one of those gets; of a score, on its scale."""
+        """Return what one of those gets; of a score, on its scale."""
         return on_scale(self.references[who], self.references, metric, self.facts["scale"])
 
     def label(self, metric: str) -> str:
-        """What tables call it."""
+        """Return what tables call it."""
         score, name = metric.startswith("score_"), metric.removeprefix("score_")
         label = self.facts["shown"].get(name, name.replace("_", " "))
         return f"score of {label}" if score else label
 
     def axis(self, metric: str) -> str:
-        """The same for the axis of a figure: with its unit; of a score with what its ends mean."""
+        """Return the same for the axis of a figure: with its unit; of a score with what its ends mean."""
         if metric.startswith("score_"):
             low, high = self.facts["scale"]
             return f"{self.label(metric)} (0: {low}, 1: {high})"
@@ -141,7 +141,7 @@ class Comparison:
         return f"{self.label(metric)} ({unit})" if unit else self.label(metric)
 
     def lower_is_better(self, metric: str) -> bool:
-        """Whether less of it is more."""
+        """Return whether less of it is more."""
         return metric in self.facts["lower_is_better"]
 
     @property
@@ -250,20 +250,20 @@ def _differences(groups: Sequence[Group]) -> dict[str, tuple[Any, ...]]:
     settings = [flat(configuration.to_dict(group.config)) for group in groups]
     names = dict.fromkeys(name for one in settings for name in one if name not in NOT_SETTINGS)
     values = {name: tuple(one.get(name, _ABSENT) for one in settings) for name in names}
-    return {name: found for name, found in values.items() if len({_show(value) for value in found}) > 1}
+    return {name: found for name, found in values.items() if len({show(value) for value in found}) > 1}
 
 
 def _is_switch(name: str, values: Sequence[Any]) -> bool:
     if name.startswith(("curriculum.", "env.")):
         return True
-    return name in _SWITCHES and len({_show(_WITHOUT.get(name, v) if v == _ABSENT else v) for v in values}) > 1
+    return name in _SWITCHES and len({show(_WITHOUT.get(name, v) if v == _ABSENT else v) for v in values}) > 1
 
 
 def _cautions(groups: Sequence[Group], differences: Mapping[str, tuple[Any, ...]]) -> Iterator[str]:
     """What weakens every sentence about these groups."""
     switches = {name: values for name, values in differences.items() if _is_switch(name, values)}
     if switches:
-        told = "; ".join(f"{name}: {' | '.join(map(_show, values))}" for name, values in switches.items())
+        told = "; ".join(f"{name}: {' | '.join(map(show, values))}" for name, values in switches.items())
         yield f"the groups differ in settings that a fair comparison has equal ({told})"
     alone = [group.name for group in groups if len(group.seeds) == 1]
     if alone:
@@ -290,5 +290,6 @@ def _about_measurement(runs: Sequence[Finished]) -> Iterator[str]:
         yield f"the sources had changes when {', '.join(changed)} ended: no commit has the code that made these numbers"
 
 
-def _show(value: Any) -> str:
+def show(value: Any) -> str:
+    """Write a setting's value as a text."""
     return value if isinstance(value, str) else json.dumps(value)

@@ -21,7 +21,7 @@ COLUMNS = ("run", "label", "seed", "env_steps", "stage", "metric", "value")
 
 
 def to_dict(comparison: Comparison) -> dict[str, Any]:
-    """The comparison as plain data: every seed's value, every interval."""
+    """Return the comparison as plain data: every seed's value, every interval."""
     names = [group.name for group in comparison.groups]
     return {
         "play": comparison.play,
@@ -58,7 +58,7 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
 
 
 def to_marl_eval(comparison: Comparison) -> dict[str, Any]:
-    """The runs as marl-eval's raw data: a mean over the episodes of each evaluation."""
+    """Return the runs as marl-eval's raw data: a mean over the episodes of each evaluation."""
     config = comparison.groups[0].config
     agents = getattr(config.env, "num_agents", None)
     task = f"{comparison.horizon}_steps" if agents is None else f"{agents}_agents_{comparison.horizon}_steps"

@@ -48,7 +48,7 @@ class Finished(NamedTuple):
 
 
 def load(path: Path, warn: Warn) -> Finished:
-    """A run that has ended or diverged. Raises UserError for any other, and where one of its files is damaged."""
+    """Read a run that has ended or diverged. Raises UserError for any other, and where one of its files is damaged."""
     folder = RunFolder.open(path)
     config = folder.config()
     because = folder.why_diverged()
@@ -126,7 +126,7 @@ def _former_facts(config: RunConfig, measured: Sequence[str]) -> dict[str, Any]:
 
 
 def require_same_task(runs: Sequence[Finished]) -> None:
-    """Raises UserError, naming two of them, for runs of different tasks, horizons or versions of MPE2."""
+    """Raise UserError, naming two of them, for runs of different tasks, horizons or versions of MPE2."""
     first = runs[0]
     for run in runs[1:]:
         horizons = first.horizon, run.horizon
@@ -156,7 +156,7 @@ def require_same_task(runs: Sequence[Finished]) -> None:
 
 
 def require_same_meaning(runs: Sequence[Finished], metric: str) -> None:
-    """Raises UserError for a metric that settings define, where these differ."""
+    """Raise UserError for a metric that settings define, where these differ."""
     for setting in runs[0].facts["defined_by"].get(metric.removeprefix("score_"), ()):
         name = f"env.{setting}"
         for run in runs[1:]:
@@ -169,7 +169,7 @@ def require_same_meaning(runs: Sequence[Finished], metric: str) -> None:
 
 
 def closing_value(run: Finished, play: Play, metric: str, member: int) -> float:
-    """Of the closing evaluation. Raises UserError where it is missing or no number."""
+    """Return a seed's value in the closing evaluation. Raises UserError where it is missing or no number."""
     try:
         value = float(run.summary["final"][play][metric]["values"][member])
     except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -185,7 +185,7 @@ def closing_value(run: Finished, play: Play, metric: str, member: int) -> float:
 
 
 def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -> dict[int, dict[str, float]]:
-    """The metrics of one seed's evaluations under the environment steps at which they took place.
+    """Return the metrics of one seed's evaluations under the environment steps at which they took place.
 
     Raises UserError, naming the line, for one that is not an evaluation, or holds what is no number.
     """
@@ -207,7 +207,7 @@ def values_along(run: Finished, play: Play, metrics: Sequence[str], seed: int) -
 
 
 def require_references(run: Finished, metric: str) -> None:
-    """Raises UserError where the summary of a run does not say what scripted policies get in a metric."""
+    """Raise UserError where the summary of a run does not say what scripted policies get in a metric."""
     references = run.summary["references"]
     for who in references:
         try:
@@ -223,7 +223,7 @@ def require_references(run: Finished, metric: str) -> None:
 def on_scale(
     values: Mapping[str, Any], references: Mapping[str, Any], metric: str, scale: Sequence[str] | None
 ) -> float:
-    """A metric among those of an evaluation; a score is made there, from the two references that are 0 and 1."""
+    """Return a metric among those of an evaluation; a score is made there, from the two references that are 0 and 1."""
     if metric in values or not metric.startswith("score_") or scale is None:
         return float(values[metric])
     name = metric.removeprefix("score_")
@@ -234,7 +234,7 @@ def on_scale(
 def with_scores(
     values: Mapping[str, Any], references: Mapping[str, Any], scale: Sequence[str] | None
 ) -> dict[str, float]:
-    """The metrics of an evaluation, and the scores that its closing one would have."""
+    """Return the metrics of an evaluation, and the scores that its closing one would have."""
     plain = {name: float(value) for name, value in values.items()}
     if scale is None:
         return plain
@@ -244,7 +244,7 @@ def with_scores(
 
 
 def flat(data: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Nested settings under dotted names."""
+    """Return nested settings under dotted names."""
     found: dict[str, Any] = {}
     for name, value in data.items():
         found.update(flat(value, f"{where}{name}.") if isinstance(value, Mapping) else {where + name: value})

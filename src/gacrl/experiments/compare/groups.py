@@ -52,20 +52,22 @@ class Group(NamedTuple):
         return tuple(run.diverged for run in self.members if run.diverged is not None)
 
     def estimate(self, metric: str) -> Estimate | None:
-        """The interquartile mean of the closing evaluation; None for less than two seeds, which have no interval."""
+        """Return the interquartile mean of the closing evaluation; None for less than two seeds, which have no
+        interval.
+        """
         return statistics.estimate(self.final[metric]) if len(self.seeds) > 1 else None
 
     def point(self, metric: str) -> float | None:
-        """The same without its interval; None where no seed came to its end."""
+        """Return the same without its interval; None where no seed came to its end."""
         return float(statistics.iqm(self.final[metric])) if self.seeds else None
 
     def reached(self) -> NDArray[np.int64]:
-        """How many seeds stand behind each point of its curve [P]."""
+        """Return how many seeds stand behind each point of its curve [P]."""
         any_metric = next(iter(self.along.values()))
         return np.isfinite(any_metric).sum(0)
 
     def curve(self, metric: str) -> Curve:
-        """The interquartile mean at each evaluation along the way, over the seeds that came so far.
+        """Return the interquartile mean at each evaluation along the way, over the seeds that came so far.
 
         The interval is NaN where that is a single one. Nothing is carried on behind a seed's end.
         """
@@ -84,7 +86,8 @@ class Group(NamedTuple):
 def grouped(
     runs: Sequence[Finished], metrics: Sequence[str], play: Play, labels: Sequence[str], notes: list[str]
 ) -> tuple[Group, ...]:
-    """The groups of these runs, in the order of their first ones; what must be noted of them is added to the notes.
+    """Form the groups of these runs, in the order of their first ones; what must be noted of them is added to the
+    notes.
 
     labels: a name for each run, or for each group; none: those of the folders. Raises UserError for another number of
     labels, one that stands for two groups, and a seed that is there twice.
@@ -102,7 +105,7 @@ def grouped(
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """The last name of each path, with as many of those before it as tell it from the other paths."""
+    """Return the last name of each path, with as many of those before it as tell it from the other paths."""
     whole = [path.resolve() if ".." in path.parts else path.absolute() for path in paths]
 
     def short(path: Path) -> str:

@@ -25,7 +25,7 @@ class EvaluatedRun:
 
 
 def to_marl_eval(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
-    """The runs as marl-eval's raw data, ready for `json.dump`: environment, task, algorithm, run, evaluation.
+    """Return the runs as marl-eval's raw data, ready for `json.dump`: environment, task, algorithm, run, evaluation.
 
     Raises UserError for a run that is there twice.
     """
@@ -47,7 +47,7 @@ def to_marl_eval(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
 
 
 def from_marl_eval(data: Mapping[str, Any]) -> list[EvaluatedRun]:
-    """The runs of marl-eval's raw data, evaluations in the order of their step counts.
+    """Return the runs of marl-eval's raw data, evaluations in the order of their step counts.
 
     Raises UserError where it is not of that form.
     """

@@ -1,15 +1,14 @@
 """A comparison in tables, and on the terminal."""
 
-import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import Equivalence, with_interval
-from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair
+from gacrl.experiments.compare.compare import TOO_FEW, Comparison, Pair, show
 from gacrl.experiments.compare.finished import closing_value
 from gacrl.experiments.compare.groups import Group
 from gacrl.report.screen import console
@@ -50,7 +49,9 @@ class _Listing(NamedTuple):
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """The tables and what must be known beside them, on standard output; on a narrow screen blocks in their place."""
+    """Print the tables and what must be known beside them, on standard output; on a narrow screen blocks in their
+    place.
+    """
     screen = console()
     for listing in listings(comparison, _SHOWN_DIFFERENCES):
         screen.print(listing.caption, overflow="fold")
@@ -63,7 +64,7 @@ def print_comparison(comparison: Comparison) -> None:
 
 
 def titled(comparison: Comparison, metric: str) -> str:
-    """What tables call a metric, and its name where that is another."""
+    """Return what tables call a metric, and its name where that is another."""
     label = comparison.label(metric)
     return label if label == metric else f"{label}: {metric}"
 
@@ -77,7 +78,7 @@ def about(comparison: Comparison) -> str:
 
 
 def listings(comparison: Comparison, most: int | None) -> list[_Listing]:
-    """The tables; at most so many differing settings, None: all."""
+    """Return the tables; at most so many differing settings, None: all."""
     listings = [_results(comparison)]
     for metric in comparison.metrics if comparison.pairs else ():
         better = "lower" if comparison.lower_is_better(metric) else "higher"
@@ -93,7 +94,7 @@ def listings(comparison: Comparison, most: int | None) -> list[_Listing]:
         # What makes the comparison unequal stands first.
         differing.sort(key=lambda item: item[0] not in comparison.unequal_switches)
         rows = [
-            (name + (" *" if name in comparison.unequal_switches else ""), *map(_value, values))
+            (name + (" *" if name in comparison.unequal_switches else ""), *map(show, values))
             for name, values in differing[:most]
         ]
         left = len(differing) - len(rows)
@@ -186,14 +187,10 @@ def _verdict(pair: Pair, lower_is_better: bool) -> str:
 
 
 def explained(comparison: Comparison) -> list[tuple[str, str]]:
-    """What the columns of the differences mean, those that are there."""
+    """Return what the columns of the differences mean, those that are there."""
     says = "whether two one-sided tests show at 5 % that the means differ by less; p is the larger of theirs"
     return [*_PAIR_EXPLAINED, *((f"equivalent within {margin:g}", says) for margin in _margins(comparison.pairs))]
 
 
 def _equivalence(test: Equivalence) -> str:
     return f"{'yes' if test.equivalent else 'not shown'} (p={test.p_value:.2g})"
-
-
-def _value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)

@@ -75,11 +75,11 @@ class Reading:
     """One of `SENSES`."""
 
     def measure(self, name: str) -> Measure:
-        """The measure of that name, or its substitute."""
+        """Return the measure of that name, or its substitute."""
         return measures()[self.swap[1] if self.swap and self.swap[0] == name else name]
 
     def describe(self) -> str:
-        """What this reading changes."""
+        """Return what this reading changes."""
         said = {
             "sampled": "closing evaluation, sampled as in training",
             "greedy": "closing evaluation, greedy",
@@ -157,7 +157,7 @@ class Judged:
 
 
 def tests(judged: Sequence[Judged]) -> tuple[tuple[Judged, ...], ...]:
-    """The claims by the test that they rest on, in the order of the first: several may rest on one."""
+    """Return the claims by the test that they rest on, in the order of the first: several may rest on one."""
     groups: dict[str, list[Judged]] = {}
     for one in judged:
         test = json.dumps([one.claim.kind, dict(one.claim.settings)], sort_keys=True)
@@ -174,18 +174,18 @@ def _data() -> dict[str, Any]:
 
 @cache
 def measures() -> dict[str, Measure]:
-    """The readings of the tables' columns."""
+    """Return the readings of the tables' columns."""
     return {name: Measure(**entry) for name, entry in _data()["measures"].items()}
 
 
 @cache
 def claims() -> tuple[Claim, ...]:
-    """Every claim, in the paper's order."""
+    """Return every claim, in the paper's order."""
     return tuple(_claim(entry) for entry in _data()["claims"])
 
 
 def untrained() -> list[dict[str, str]]:
-    """The readings that would need other training: {place, setting}."""
+    """Return the readings that would need other training: {place, setting}."""
     return _data()["untrained"]
 
 

@@ -123,7 +123,7 @@ def _flight(reading: Reading, evidence: Evidence) -> str:
 
 
 def trend(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """The change from a point of training to its end; and less the change of random, which the difficulty makes.
+    """Return the change from a point of training to its end; and less the change of random, which the difficulty makes.
 
     "Not worse" is meant despite the difficulty: it is asked of the latter.
     """
@@ -166,7 +166,7 @@ def _moves(change: Values, direction: str, margin: float) -> Agreement:
 def against_random(
     own: Values, random: Float[np.ndarray, " blocks"], margin: float
 ) -> tuple[Chance, Difference, str]:
-    """Whether values of ours can be told from random's, their difference, and what the equivalence test says."""
+    """Return whether values of ours can be told from random's, their difference, and what the equivalence test says."""
     found, test = difference(own, random), equivalent(own, random, margin)
     told = found.low > 0 or found.high < 0
     chance = TOLD if told else EQUIVALENT if test.equivalent else NOT_TOLD

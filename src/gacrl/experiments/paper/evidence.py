@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gacrl.config.run import RunConfig
+from gacrl.experiments import results
 from gacrl.experiments.paper import references as scripted
 from gacrl.experiments.paper.references import Difficulty, Episodes, difficulty
 from gacrl.experiments.paper.tables import SCRIPTED
 from gacrl.experiments.provenance import Versions, made_by
-from gacrl.experiments.study import read_summary, reading, why_diverged
+from gacrl.experiments.results import reading, why_diverged
 from gacrl.training.recorder import RunFolder
 
 Play = Literal["training", "sampled", "greedy"]
@@ -99,11 +100,11 @@ class Evidence:
     """What ended the training of those that are not in `series`."""
 
     def has(self, column: str, who: str) -> bool:
-        """Whether an algorithm was trained to its end."""
+        """Return whether an algorithm was trained to its end."""
         return (_trained_on(column, who), who) in self.series
 
     def trained(self, column: str, who: str) -> Series:
-        """An algorithm's series. Raises MissingRun for one that diverged.
+        """Return an algorithm's series. Raises MissingRun for one that diverged.
 
         The column `mixed` has GACRL on the paper's reward and everyone else on MPE2's.
         """
@@ -113,11 +114,11 @@ class Evidence:
         return self.series[column, who]
 
     def reference(self, column: str, who: str) -> Reference:
-        """A scripted policy in a column's task."""
+        """Return a scripted policy in a column's task."""
         return self.references["paper" if column == "mixed" else column, who]
 
     def values(self, weights: Mapping[str, float], who: str, play: Play, column: str) -> Float[np.ndarray, " S"]:
-        """A measure (a weighted sum of metrics) at the end: one number a seed.
+        """Return a measure (a weighted sum of metrics) at the end: one number a seed.
 
         A scripted policy has no seeds: its numbers are means over blocks of `FINAL_EPISODES` episodes.
         """
@@ -133,31 +134,30 @@ def _trained_on(column: str, who: str) -> str:
 
 
 def measured(weights: Mapping[str, float], metrics: Metrics) -> Float[np.ndarray, "..."]:
-    """The weighted sum of the metrics."""
+    """Return the weighted sum of the metrics."""
     return np.sum([weight * metrics[name] for name, weight in weights.items()], axis=0)
 
 
 def blocks(episodes: Float[np.ndarray, " E"], size: int = FINAL_EPISODES) -> Float[np.ndarray, " blocks"]:
-    """Means of blocks of episodes; at least two blocks, however few episodes there are."""
+    """Return means of blocks of episodes; at least two blocks, however few episodes there are."""
     count = max(len(episodes) // size, 2)
     size = min(size, len(episodes) // count)
     return episodes[: count * size].reshape(count, size).mean(1)
 
 
 def read_series(path: Path) -> Series:
-    """A finished run folder. Raises UserError for a damaged one."""
+    """Read a finished run folder. Raises UserError for a damaged one."""
     with reading(path):
         return _read_series(path)
 
 
 def _read_series(path: Path) -> Series:
-    folder = RunFolder.open(path)
-    config, rows = folder.config(), folder.metrics()
-    summary = read_summary(folder, config)
-    by_seed = [[row for row in rows if row["seed"] == seed] for seed in config.seeds]
+    config = RunFolder.open(path).config()
+    found = results.read(path, config)
+    by_seed = found.rows
     ended = np.array([[row["train"]["episodes"] for row in seen] for seen in by_seed])
     kept = np.flatnonzero(ended.min(0) > 0)
-    names = list(rows[0]["train"]["mean"])
+    names = list(by_seed[0][0]["train"]["mean"])
 
     def stacked(what: str) -> dict[str, np.ndarray]:
         return {
@@ -176,17 +176,12 @@ def _read_series(path: Path) -> Series:
         last=_with_fixed_ratio(stacked("last_episode"), ends),
         tasks=tuple(by_seed[0][k]["task"] for k in kept),
         final={
-            kind: _with_fixed_ratio(_final(summary["final"][kind]), config.env.local_ratio)
-            for kind in ("greedy", "sampled")
+            kind: _with_fixed_ratio(found.final(kind), config.env.local_ratio) for kind in ("greedy", "sampled")
         },
-        scripted=summary["references"],
-        seconds=float(summary["wall_seconds"]),
+        scripted=found.summary["references"],
+        seconds=float(found.summary["wall_seconds"]),
         made_by=made_by([path]),
     )
-
-
-def _final(metrics: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    return {name: np.array(entry["values"]) for name, entry in metrics.items() if not name.startswith("score_")}
 
 
 def _with_fixed_ratio(metrics: Metrics, ratio: float | np.ndarray) -> Metrics:
@@ -202,7 +197,7 @@ def _with_fixed_ratio(metrics: Metrics, ratio: float | np.ndarray) -> Metrics:
 def gather(
     folders: Mapping[tuple[str, str], Path], out: Path, say: Callable[[str], None] = lambda sentence: None
 ) -> Evidence:
-    """The evidence of run folders that are finished or diverged, and of scripted policies in the same tasks.
+    """Gather the evidence of run folders that are finished or diverged, and of scripted policies in the same tasks.
 
     out: the study's folder, which keeps the episodes of the scripted policies.
     """

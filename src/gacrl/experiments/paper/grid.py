@@ -23,8 +23,9 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import difference, estimate
-from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.experiments.provenance import Versions, code_of, doubts
 from gacrl.experiments.study import claim_folder
+from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
 from gacrl.report.screen import Pace
@@ -126,7 +127,10 @@ class Sweep:
 
 
 def paper_grid(seeds: SupportsIndex = 2, episodes: SupportsIndex = 500) -> Grid:
-    """The paper's 27 points, by shaped reward over the first 500 episodes. Raises UserError for impossible sizes."""
+    """Return the paper's 27 points, by shaped reward over the first 500 episodes.
+
+    Raises UserError for impossible sizes.
+    """
     seeds, episodes = whole(seeds, "seeds"), whole(episodes, "episodes")
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no telling noise from merit")
@@ -187,7 +191,7 @@ def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | No
 
 
 def noise_of(scores: np.ndarray) -> Noise:
-    """The spread of the means of scores [points, seeds] beside what chance would make of it.
+    """Return the spread of the means of scores [points, seeds] beside what chance would make of it.
 
     All points have the same seeds, and so the same starts: a seed's own luck is no part of their differences
     (two-way layout without interaction).
@@ -204,7 +208,7 @@ def noise_of(scores: np.ndarray) -> Noise:
 
 
 def expected_range(count: int) -> float:
-    """The mean of the largest less the smallest of so many standard normal numbers."""
+    """Return the mean of the largest less the smallest of so many standard normal numbers."""
     x = np.linspace(-9.0, 9.0, 20_001)
     below = stats.norm.cdf(x)
     return float(np.trapezoid(1 - below**count - (1 - below) ** count, x))
@@ -372,9 +376,9 @@ def _report(grid: Grid, done: Sweep) -> None:
     page.table(("learning rate", "ε₀", "τ₀", "mean", "seeds", ""), rows)
     page.heading("How this was made")
     page.code(f"gacrl sweep paper-grid --seeds {len(grid.seeds)} --episodes {grid.episodes}")
-    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
+    page.text(code_of(done.made_by))
     page.write(done.out, "report")
-    (done.out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
+    replace_json(done.out / "summary.json", done.to_dict())
 
 
 def _noise_sentence(noise: Noise, points: int, seeds: int) -> str:

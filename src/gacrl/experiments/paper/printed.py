@@ -151,7 +151,7 @@ class _Cell:
 
 
 def peak(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """A printed best of the log against the best of as many log lines of ours, and of random."""
+    """Return a printed best of the log against the best of as many log lines of ours, and of random."""
     measure, printed = reading.measure(claim.settings["measure"]), float(claim.settings["printed"])
     series = evidence.trained(reading.column, "GACRL")
     logged = measured(measure.weights, series.last if reading.row == "episode" else series.mean)

@@ -24,6 +24,7 @@ from gacrl.config.run import RunConfig
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.references import scripted_program
 from gacrl.experiments.paper.tables import SCRIPTED
+from gacrl.replacing import replaced
 
 EPISODES = 20_000
 """Of each scripted policy: with 320 a printed mean of 50 falls outside random's interval by noise in 26 % of cases."""
@@ -36,7 +37,7 @@ Episodes = Mapping[str, Float[np.ndarray, " E"]]
 
 
 def difficulty(numbers: Mapping[str, float]) -> Difficulty:
-    """The difficulty in a row of `metrics.jsonl`."""
+    """Return the difficulty in a row of `metrics.jsonl`."""
     return float(numbers["local_ratio"]), float(numbers["coverage_threshold"])
 
 
@@ -103,6 +104,5 @@ def _read(file: Path, asked: str) -> dict[str, dict[str, np.ndarray]] | None:
 
 def _write(file: Path, asked: str, held: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     arrays = {f"{who}/{metric}": values for who, metrics in held.items() for metric, values in metrics.items()}
-    unfinished = file.with_name(f".{file.name}.unfinished.npz")
-    np.savez_compressed(unfinished, asked=np.array(asked), **arrays)  # pyright: ignore[reportArgumentType]
-    unfinished.replace(file)
+    with replaced(file) as opened:
+        np.savez_compressed(opened, asked=np.array(asked), **arrays)  # pyright: ignore[reportArgumentType]

@@ -3,7 +3,6 @@
 Every number and every verdict in it is computed from the runs; the sentences around them are here.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from gacrl.experiments.paper.evidence import COLUMNS, Evidence
 from gacrl.experiments.paper.final_metrics import interquartile
 from gacrl.experiments.paper.references import EPISODES
 from gacrl.experiments.paper.tables import SCRIPTED
-from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.experiments.provenance import Versions, code_of, doubts
+from gacrl.replacing import replace_json
 from gacrl.report.page import Page
 
 _INDICATIVE = 10
@@ -51,7 +51,7 @@ def write(out: Path, evidence: Evidence, judged: Sequence[Judged], seeds: int, e
         "table_3": [row.to_dict() for row in final_metrics.rows(evidence)],
         "claims": report_verdicts.results(judged),
     }
-    (out / "results.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    replace_json(out / "results.json", data, indent=1)
     return page.write(out, "report")
 
 
@@ -145,7 +145,7 @@ def _making(page: Page, evidence: Evidence, seeds: int, episodes: int) -> None:
         for (column, who), series in evidence.series.items()
     ]
     page.table(("who", "trained on", "seeds", "steps a seed", "time, all seeds", "settings"), rows)
-    page.text(f"Code of commit {', '.join(commits(_made_by(evidence)))}.")
+    page.text(code_of(_made_by(evidence)))
 
 
 def _settings(config: RunConfig) -> str:

@@ -134,7 +134,7 @@ def table_2(page: Page, evidence: Evidence) -> None:
 
 
 def printed_numbers(page: Page, evidence: Evidence, judged: Sequence[Judged]) -> None:
-    """The means of Table III beside random, doing nothing and the oracle."""
+    """Write the means of Table III beside random, doing nothing and the oracle."""
     page.heading("What the printed numbers say")
     by_label = {measure.label: measure for measure in measures().values()}
     inside = beaten = 0
@@ -190,7 +190,7 @@ def _printed_peaks() -> list[float]:
 
 
 def environment_svg() -> str:
-    """The paper's Figure 1: a start of the environment, as SVG."""
+    """Return the paper's Figure 1: a start of the environment, as SVG."""
     import matplotlib
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle

@@ -32,7 +32,7 @@ _CHANCES = {TOLD: TOLD, NOT_TOLD: NOT_TOLD, EQUIVALENT: EQUIVALENT, NO_CHANCE: "
 
 
 def summary(page: Page, judged: Sequence[Judged]) -> None:
-    """How many tests came out how, and which."""
+    """Write how many tests came out how, and which."""
     found = tests(judged)
     counts = Counter(test[0].base.agreement for test in found)
     as_random = sum(test[0].base.agreement == AGREES and test[0].base.chance in AS_RANDOM for test in found)
@@ -75,7 +75,7 @@ def _count(found: Sequence[Test], agreement: str, chance: str) -> int:
 
 
 def method(page: Page) -> None:
-    """What the words of the verdicts mean."""
+    """Write what the words of the verdicts mean."""
     page.heading("How to read the verdicts")
     page.text(
         '"Agrees": another run like ours may print that number, or our seeds show what is claimed. A printed number is '
@@ -93,7 +93,7 @@ def method(page: Page) -> None:
 
 
 def every_test(page: Page, judged: Sequence[Judged]) -> None:
-    """All tests with the numbers that decide, and what other readings change."""
+    """Write all tests with the numbers that decide, and what other readings change."""
     page.heading("Every test, with its numbers")
     rows = [
         [
@@ -115,7 +115,7 @@ def every_test(page: Page, judged: Sequence[Judged]) -> None:
 
 
 def every_reading(page: Page, judged: Sequence[Judged]) -> None:
-    """All tests under all readings."""
+    """Write all tests under all readings."""
     page.heading("Every verdict under every reading")
     rows = [
         [test[0].claim.id, outcome.reading.describe(), outcome.verdict, outcome.because]
@@ -129,7 +129,7 @@ def every_reading(page: Page, judged: Sequence[Judged]) -> None:
 
 
 def results(judged: Sequence[Judged]) -> list[dict[str, Any]]:
-    """Every claim as JSON data; those with the same `test` rest on one."""
+    """Return every claim as JSON data; those with the same `test` rest on one."""
     named = {id(one): test[0].claim.id for test in tests(judged) for one in test}
     return [
         {

@@ -70,7 +70,7 @@ class Reproduction:
 
 
 def at_paper_budget(preset: str) -> RunConfig:
-    """A preset with settings that suit the paper's number of steps, on MPE2's task with its 75-step episodes."""
+    """Return a preset with settings that suit the paper's number of steps, on MPE2's task with its 75-step episodes."""
     config = configuration.from_dict(_AT_PAPER_BUDGET[preset], presets.preset(preset))
     return replace(
         config,
@@ -81,7 +81,7 @@ def at_paper_budget(preset: str) -> RunConfig:
 
 
 def in_column(config: RunConfig, column: Column) -> RunConfig:
-    """The same with the column's reward: the paper's, and its curriculum; or MPE2's on an unchanging task."""
+    """Return the same with the column's reward: the paper's, and its curriculum; or MPE2's on an unchanging task."""
     if column != "paper":
         return config
     return replace(config, env=presets.preset("paper").env)
@@ -90,7 +90,7 @@ def in_column(config: RunConfig, column: Column) -> RunConfig:
 def plan(
     out: Path, seeds: int, episodes: int = EPISODES, extended: bool = False
 ) -> dict[tuple[Column, str], Planned]:
-    """The runs of the experiment by column and algorithm, in the order in which they are made."""
+    """Return the runs of the experiment by column and algorithm, in the order in which they are made."""
     configs: dict[tuple[Column, str], RunConfig] = {}
     columns: tuple[Column, ...] = ("paper", "mpe2")
     for column in columns:

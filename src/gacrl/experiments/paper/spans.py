@@ -42,7 +42,7 @@ class Spans(NamedTuple):
 
 @lru_cache(maxsize=256)
 def table_spans(rows: tuple[Row, ...], reading: Reading, evidence: Evidence) -> tuple[Spans, ...]:
-    """The intervals of every cell of a table, in its order. Raises MissingRun for a row that has no runs."""
+    """Return the intervals of every cell of a table, in its order. Raises MissingRun for a row that has no runs."""
     ours = family([_of_ours(row, reading, evidence) for row in rows])
     random = family([_of_random(row, reading, evidence) for row in rows])
     return tuple(Spans(*pair) for pair in zip(ours, random, strict=True))
@@ -81,12 +81,12 @@ def _interval(ordered: Float[np.ndarray, " R"], level: float) -> Span:
 
 
 def inside(printed: float, span: Span) -> bool:
-    """Whether a printed number may lie there, before it was rounded."""
+    """Return whether a printed number may lie there, before it was rounded."""
     return span[0] - ROUNDING <= printed <= span[1] + ROUNDING
 
 
 def of_one(draws: Float[np.ndarray, " R"]) -> Span:
-    """The 95 % interval of a number that stands alone."""
+    """Return the 95 % interval of a number that stands alone."""
     low, high = np.percentile(draws, [2.5, 97.5])
     return float(low), float(high)
 
@@ -101,7 +101,7 @@ def best_of_random(measure: Measure, reading: Reading, evidence: Evidence) -> Sp
 
 
 def best_of_ours(measure: Measure, reading: Reading, evidence: Evidence) -> Span:
-    """The same of one more training like ours."""
+    """Return the same of one more training like ours."""
     rng = np.random.default_rng(0)
     series = evidence.trained(reading.column, "GACRL")
     member = rng.integers(len(series.config.seeds), size=RESAMPLES)
@@ -112,7 +112,7 @@ def best_of_ours(measure: Measure, reading: Reading, evidence: Evidence) -> Span
 
 
 def random_interval(episodes: Float[np.ndarray, " E"], size: int) -> Span:
-    """Where 95 % of the means of so many episodes lie."""
+    """Return where 95 % of the means of so many episodes lie."""
     return of_one(_means(episodes[:, None], size, np.random.default_rng(0))[:, 0])
 
 

@@ -51,19 +51,19 @@ class Row:
 
 @cache
 def printed() -> dict[str, Any]:
-    """The paper's own numbers."""
+    """Return the paper's own numbers."""
     return json.loads(
         resources.files("gacrl.experiments.paper").joinpath("paper.json").read_text(encoding="utf-8")
     )
 
 
 def apply_to(config: RunConfig) -> bool:
-    """Whether a run is the paper's algorithm on the paper's reward."""
+    """Return whether a run is the paper's algorithm on the paper's reward."""
     return config.algorithm.name == "gacrl_paper" and getattr(config.env, "reward", None) == "paper"
 
 
 def table_2(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
-    """The selected episodes: the paper's row, each seed's very episode, and what scripted policies get.
+    """Return the selected episodes: the paper's row, each seed's very episode, and what scripted policies get.
 
     metrics: the rows of `metrics.jsonl`. Episodes at which this run did not log are left out.
     """
@@ -79,7 +79,7 @@ def table_2(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
 
 
 def table_3(config: RunConfig, metrics: list[dict[str, Any]]) -> list[Row]:
-    """The stretch of training that ended last: mean ± standard deviation over its episodes."""
+    """Return the stretch of training that ended last: mean ± standard deviation over its episodes."""
     logged = _by_episode(metrics)
     if not logged:
         return []
@@ -125,7 +125,7 @@ def _references(config: RunConfig, episode: int, task: Mapping[str, float]) -> l
 
 
 def reference_episodes(name: str, config: RunConfig, task: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Every metric of the episodes [E] of a scripted policy, at the difficulty of a row of `metrics.jsonl`."""
+    """Return every metric of the episodes [E] of a scripted policy, at the difficulty of a row of `metrics.jsonl`."""
     return _play_scripted(name, config, task["local_ratio"], task["coverage_threshold"])
 
 

@@ -30,12 +30,12 @@ from gacrl.tasks.spread.shaping import paper_shaped_reward
 
 
 def judge_all(evidence: Evidence) -> tuple[Judged, ...]:
-    """Every claim under every reading."""
+    """Judge every claim under every reading."""
     return tuple(judge(claim, evidence) for claim in claims())
 
 
 def judge(claim: Claim, evidence: Evidence) -> Judged:
-    """One claim under every reading."""
+    """Judge one claim under every reading."""
 
     def under(reading: Reading) -> Outcome:
         try:
@@ -48,7 +48,7 @@ def judge(claim: Claim, evidence: Evidence) -> Judged:
 
 
 def in_print(claim: Claim) -> str:
-    """Whether an order among the four algorithms is there in the paper's own Table III."""
+    """Return whether an order among the four algorithms is there in the paper's own Table III."""
     table = paper_tables.printed()["table_3"]
     others = [*claim.settings.get("better_than", ()), *claim.settings.get("worse_than", ())]
     if claim.kind != "order" or not set(others) <= set(table["rows"]):
@@ -63,7 +63,9 @@ def in_print(claim: Claim) -> str:
 
 
 def possible(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """Whether a row's raw reward can go with its coverage: whoever is not covered is at least the radius away."""
+    """Return whether a row's raw reward can go with its coverage: whoever is not covered is at least the radius
+    away.
+    """
     table = paper_tables.printed()["table_2"]
     ratio, agents = float(claim.settings["local_ratio"]), 3
     curriculum = evidence.trained("paper", "GACRL").config
@@ -84,7 +86,7 @@ def possible(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def formula(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """Equation (1), without r_raw and collisions: it pays nobody more than who stands on a landmark.
+    """Compute equation (1), without r_raw and collisions: it pays nobody more than who stands on a landmark.
 
     Inside the paper's space of 2 × 2 no landmark is further away than from corner to corner.
     """
@@ -101,7 +103,7 @@ def formula(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def stated_once(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """A setting that the paper states in several places is the same in all."""
+    """Judge whether a setting that the paper states in several places is the same in all."""
     stated: Mapping[str, Sequence[float]] = claim.settings["stated"]
     because = "; ".join(f"{place}: {start:g} to {end:g}" for place, (start, end) in stated.items())
     compared = 1 if reading.sense == "start" else 2
@@ -110,7 +112,7 @@ def stated_once(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def duration(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """How long one run takes here: other hardware tests no printed hours."""
+    """Return how long one run takes here: other hardware tests no printed hours."""
     series = evidence.trained("paper", "GACRL")
     full = series.config.curriculum.episodes
     hours = series.seconds / 3600 / len(series.config.seeds) * full / int(series.episodes[-1])
@@ -122,7 +124,7 @@ def duration(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def elsewhere(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """What this experiment does not decide."""
+    """Return what this experiment does not decide."""
     return Outcome(UNTESTED, NO_CHANCE, claim.settings["reason"])
 
 

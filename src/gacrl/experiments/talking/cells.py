@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gacrl import tasks
 from gacrl.algorithms.actions import choices
@@ -15,20 +14,17 @@ from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.evaluation import references
 from gacrl.evaluation.statistics import Estimate, estimate, mean, probability_of_improvement
-from gacrl.experiments import scoring
-from gacrl.experiments.study import Planned, read_summary, reading, why_diverged
+from gacrl.experiments import results, scoring
+from gacrl.experiments.results import Finals, Values, reading, why_diverged
+from gacrl.experiments.study import Planned
 from gacrl.experiments.talking.kinds import NONE, SILENT, TOLD, num_parameters
 from gacrl.messages import interventions
 from gacrl.messages.bits import bits_sent
 from gacrl.networks.agent import matched
+from gacrl.replacing import replace_json
 from gacrl.tasks.task import MATTERS, Case, Task
 from gacrl.tasks.task import SILENT as SILENTLY
 from gacrl.tasks.task import TOLD as KNOWING
-from gacrl.training.recorder import RunFolder
-
-Values = NDArray[np.float64]
-Finals = Mapping[str, Values]
-"""Per metric: each seed's value [S]."""
 
 CAUGHT: Mapping[str, str] = {"silenced": "silence", "scrambled": "scramble", "a step late": "delay 1"}
 """What happens to messages, and the intervention that does it."""
@@ -57,7 +53,7 @@ class Ended:
     caught: Mapping[str, Finals]
     """The same by what happened to the messages; empty where there are none."""
     evaluated_at: tuple[int, ...]
-    along: Mapping[str, NDArray[np.float64]]
+    along: Mapping[str, Values]
     """Of the headline and of what is to be reached, along training [S, P]."""
     diverged: str | None = None
 
@@ -102,8 +98,8 @@ class Played:
         }
         if not known:
             return None
-        pick = max if self.task.metric(headline).higher_is_better else min
-        who = pick(known, key=lambda name: known[name])
+        sign = self.task.metric(headline).sign
+        who = max(known, key=lambda name: sign * known[name])
         return Best(who, known[who])
 
     def scores(self, values: Values) -> Values | None:
@@ -121,7 +117,7 @@ class Played:
     def better_than_silence(self, kind: str) -> Estimate | None:
         """Return P(a seed does better than one of the better silent learner); None where one of both is missing."""
         headline = self.task.headline
-        sign = 1.0 if self.task.metric(headline).higher_is_better else -1.0
+        sign = self.task.metric(headline).sign
         silent = [sign * self.learners[name].final[headline] for name in SILENT if self._ended(name)]
         if not silent or not self._ended(kind):
             return None
@@ -162,7 +158,7 @@ class Played:
         }
 
 
-def _listed(values: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
+def _listed(values: Mapping[str, Values]) -> dict[str, Any]:
     return {name: np.round(found, 4).tolist() for name, found in values.items()}
 
 
@@ -182,9 +178,7 @@ def catch(run: Planned, say: Callable[[str], None]) -> None:
         }
         for how, words in CAUGHT.items()
     }
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    unfinished.write_text(json.dumps(found) + "\n", encoding="utf-8")
-    unfinished.replace(file)
+    replace_json(file, found, indent=None)
 
 
 def played(name: str, task: str, case: Case, runs: Mapping[str, Planned]) -> Played:
@@ -207,21 +201,15 @@ def _ended(run: Planned, task: Task, case: Case) -> Ended:
     if because is not None:
         return Ended(run.config, parameters, bits, {}, {}, (), {}, because)
     with reading(run.folder):
-        folder = RunFolder.open(run.folder)
-        final = read_summary(folder, run.config)["final"]["greedy"]
-        rows, seeds = folder.metrics(), run.config.seeds
-        along = {
-            metric: np.array([[row["greedy"][metric] for row in rows if row["seed"] == seed] for seed in seeds])
-            for metric in dict.fromkeys((task.headline, case.reached))
-        }
+        found = results.read(run.folder, run.config)
         return Ended(
             config=run.config,
             parameters=parameters,
             bits=bits,
-            final={m: np.array(entry["values"]) for m, entry in final.items() if not m.startswith("score_")},
+            final=found.final(),
             caught=_read_caught(run.folder),
-            evaluated_at=tuple(sorted({row["env_steps"] for row in rows})),
-            along=along,
+            evaluated_at=found.evaluated_at,
+            along={metric: found.along("greedy", metric) for metric in (task.headline, case.reached)},
         )
 
 

@@ -95,7 +95,7 @@ def _counted(task: str, settings: Any, network: NetworkConfig, draws: bool) -> i
 
 
 def sends(communication: str, shared: Base) -> RunConfig:
-    """The learner with another kind of messages, or with none."""
+    """Return the learner with another kind of messages, or with none."""
     return hears_by(communication, shared.talking, shared.parameters)
 
 
@@ -142,7 +142,7 @@ def remembering(shared: Base) -> RunConfig | None:
 
 
 def uttering(shared: Base) -> RunConfig | None:
-    """Agents whose words are actions."""
+    """Make the settings of agents whose words are actions."""
     if shared.case.utterances is None:
         return None
     silent = sends(NONE, shared)

@@ -6,7 +6,7 @@ import numpy as np
 
 from gacrl.config.run import RunConfig
 from gacrl.evaluation.statistics import estimate, mean, sample_efficiency, with_interval
-from gacrl.experiments.provenance import Versions, commits, doubts
+from gacrl.experiments.provenance import Versions, code_of, doubts
 from gacrl.experiments.talking.cells import CAUGHT, REACHED, Ended, Finals, Played
 from gacrl.experiments.talking.kinds import SYMBOLS, kinds
 from gacrl.report import figures
@@ -53,7 +53,7 @@ def page(
         "episode. Bits are those that an agent sends in a step of greedy play; a number counts 32."
     )
     made.code(command)
-    made.text(f"Code of commit {', '.join(commits(versions))}.")
+    made.text(code_of(versions))
     return made
 
 

@@ -3,7 +3,6 @@
 A cell that is done is not run again, whichever tasks and kinds are asked for: the report shows all that are there.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from gacrl.experiments.talking import kinds as talkers
 from gacrl.experiments.talking import report
 from gacrl.experiments.talking.cells import Played, catch, played
 from gacrl.experiments.talking.trials import FACTORS, tried, tuned
+from gacrl.replacing import replace_json
 from gacrl.tasks.task import Case
 from gacrl.training.recorder import RunFolder
 
@@ -111,7 +111,7 @@ def study(
     command, made = _command(config, seeds, scale, trials, found), made_by(cell.run.folder for cell in ended)
     page = report.page(found, config, seeds, trials, command, made)
     done = Study(out, page.write(out, "report"), command, found, made)
-    (out / "summary.json").write_text(json.dumps(done.to_dict(), indent=1) + "\n", encoding="utf-8")
+    replace_json(out / "summary.json", done.to_dict(), indent=1)
     return done
 
 

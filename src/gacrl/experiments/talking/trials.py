@@ -7,7 +7,8 @@ import numpy as np
 
 from gacrl import tasks
 from gacrl.config import files as configuration
-from gacrl.experiments.study import Planned, reading, why_diverged
+from gacrl.experiments.results import reading, why_diverged
+from gacrl.experiments.study import Planned
 from gacrl.training.recorder import RunFolder
 
 FACTORS = (1.0, 1 / 3, 3.0, 1 / 9, 9.0)
@@ -49,4 +50,4 @@ def _worth(trial: Planned) -> float:
     with reading(trial.folder):
         rows = RunFolder.open(trial.folder).metrics()
         last = [row["greedy"][task.headline] for row in rows if row["env_steps"] == rows[-1]["env_steps"]]
-        return float(np.mean(last)) * (1.0 if task.metric(task.headline).higher_is_better else -1.0)
+        return float(np.mean(last)) * task.metric(task.headline).sign

@@ -18,7 +18,7 @@ __all__ = [
 
 
 def kind_of(config: NetworkConfig) -> type[Communication]:
-    """The class of messages that the configuration names."""
+    """Return the class of messages that the configuration names."""
     return resolve(COMMUNICATION[config.communication])
 
 

@@ -77,7 +77,7 @@ class Communication(eqx.Module):
     """Bits of each number that is sent in play, where these are no symbols."""
 
     def empty_inbox(self, num_agents: int) -> Any:
-        """What nobody has said anything into; () for a kind that is heard in the step in which it is said."""
+        """Return what nobody has said anything into; () for a kind that is heard in the step in which it is said."""
         return ()
 
     def hear(

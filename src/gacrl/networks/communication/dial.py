@@ -54,7 +54,7 @@ class Dial(Communication):
 
 
 def discretise_regularise(message: Float[Array, "N V"], key: PRNGKey | None, noise: float) -> Float[Array, "N V"]:
-    """DIAL's DRU: σ(m + noise · N(0, 1)) while learning (with a key), 1{m > 0} when not."""
+    """Apply DIAL's DRU: σ(m + noise · N(0, 1)) while learning (with a key), 1{m > 0} when not."""
     if key is None:
         return (message > 0).astype(message.dtype)
     return jax.nn.sigmoid(message + noise * jax.random.normal(key, message.shape))

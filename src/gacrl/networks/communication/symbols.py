@@ -112,7 +112,7 @@ class Symbols(Communication):
     def symbol(
         self, logits: Float[Array, "N V"], key: PRNGKey | None, temperature: Float[Array, ""] | float
     ) -> Float[Array, "N V"]:
-        """The symbols of a round, from their logits; without a key as they are played."""
+        """Return the symbols of a round, from their logits; without a key as they are played."""
 
 
 class DiscreteSymbols(Symbols):

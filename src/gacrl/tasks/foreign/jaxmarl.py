@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from gacrl.envs.environment import EnvParams, EnvState, TimeStep, observe
 from gacrl.errors import ConfigError
@@ -161,10 +161,6 @@ class JaxmarlTask(Padded):
         told = self.env.get_avail_actions(inner)
         rows = [jnp.asarray(told[agent]).reshape(-1).astype(bool) for agent in self.layout.agents]
         return jnp.stack([jnp.pad(row, (0, self.num_actions - row.size)) for row in rows])
-
-    def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors; each agent may do what it can."""
-        return observe(features, available=jnp.asarray(self.layout.mask))
 
     def unstack(self, actions: Int[Array, " N"] | np.ndarray) -> list[Any]:
         """Return the agents' actions one by one."""

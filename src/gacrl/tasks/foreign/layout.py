@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
-from gacrl.envs.environment import Environment
+from gacrl.envs.environment import Environment, observe
 from gacrl.errors import ConfigError
+from gacrl.types import Observation
 
 MOST_CHOICES = 64
 """Of an agent whose action has several parts: the product of their sizes."""
@@ -138,6 +140,10 @@ class Padded(Environment):
     def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """O: the most that an agent sees, and its role."""
         return self.layout.observation_size
+
+    def from_features(self, features: Float[Array, "N O"]) -> Observation:
+        """Return the observation around bare feature vectors; each agent may do what it can."""
+        return observe(features, available=jnp.asarray(self.layout.mask))
 
 
 def lay_out(task: str, agents: Sequence[str], seen: Mapping[str, Any], does: Mapping[str, Any]) -> Layout:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gacrl.config.checks import unknown
-from gacrl.envs.environment import EnvParams, EnvState, TimeStep, as_floats, observe
+from gacrl.envs.environment import EnvParams, EnvState, TimeStep, as_floats
 from gacrl.envs.hosted import Copies, Hosted
 from gacrl.errors import ConfigError
 from gacrl.tasks import Own
@@ -23,7 +23,7 @@ from gacrl.tasks.foreign.crew import Crew
 from gacrl.tasks.foreign.layout import Layout, Padded, Reach, lay_out
 from gacrl.tasks.foreign.worlds import Recipe, Scripted
 from gacrl.tasks.task import Task
-from gacrl.types import Observation, PRNGKey
+from gacrl.types import PRNGKey
 
 SCHEME = "pettingzoo:"
 _NOBODY: Scripted = MappingProxyType({})
@@ -214,10 +214,6 @@ class Zoo(Padded, Hosted):  # pyright: ignore[reportIncompatibleVariableOverride
         """Return an outcome of zeros, the mean reward among its measurements: of those who acted."""
         state, after = super().step(state, action, key, params)
         return state, after._replace(info={"reward_raw": jnp.zeros(())})
-
-    def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors; each agent may do what it can."""
-        return observe(features, available=jnp.asarray(self.layout.mask))
 
     def stack(self, rows: Any) -> Float[np.ndarray, "N O"]:
         """Lay out what the agents see. Raises ConfigError where it does not fit."""

@@ -117,7 +117,7 @@ class World:
             self._allow(i, agent, infos)
 
     def require_finite(self) -> None:
-        """Raises Faulty where an agent sees a number that is not finite."""
+        """Raise Faulty where an agent sees a number that is not finite."""
         bad = np.flatnonzero(~np.isfinite(self.features).all(1))
         if bad.size:
             raise Faulty(self._told(self.layout.agents[bad[0]], "saw a number that is not finite"))

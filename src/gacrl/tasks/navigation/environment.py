@@ -23,6 +23,8 @@ MOVES = len(DIRECTIONS)
 
 
 class NavigationState(NamedTuple):
+    """N agents and L landmarks; lengths and velocities in MPE2's units."""
+
     positions: Float[Array, "N 2"]
     velocities: Float[Array, "N 2"]
     landmarks: Float[Array, "L 2"]
@@ -88,7 +90,7 @@ class Navigation(Environment):
         return self.num_agents - 1 if self.rules.bodies else 0
 
     def default_params(self) -> NavigationParams:
-        """The numbers of the settings, as data to every compiled program."""
+        """Return the numbers of the settings, as data to every compiled program."""
         params = NavigationParams(Physics(), self.local_ratio, self.goal_bonus)
         return jax.tree.map(lambda number: jnp.asarray(number, float), params)
 

@@ -66,7 +66,7 @@ class SpreadParams(NamedTuple):
 
 
 def params_of(settings: SpreadSettings, gamma: float = 1.0, padded: bool = False) -> SpreadParams:
-    """The numbers of the task as arrays, so that they are data to every compiled program.
+    """Return the numbers of the task as arrays, so that they are data to every compiled program.
 
     gamma: the learner's discount, for the reward `potential`. padded: with masks, in which all are there.
     """
@@ -89,6 +89,8 @@ def params_of(settings: SpreadSettings, gamma: float = 1.0, padded: bool = False
 
 
 class SpreadState(NamedTuple):
+    """N agents and L landmarks; lengths and velocities in MPE2's units."""
+
     positions: Float[Array, "N 2"]
     velocities: Float[Array, "N 2"]
     landmarks: Float[Array, "L 2"]
@@ -126,11 +128,11 @@ class Spread(SpreadSettings, Environment):
         return 1 if self.reset_on_collision == "truncate" else self.max_cycles
 
     def default_params(self) -> SpreadParams:
-        """The numbers of the settings; γ is 1, and nobody is absent."""
+        """Return the numbers of the settings; γ is 1, and nobody is absent."""
         return params_of(self)
 
     def reset(self, key: PRNGKey, params: SpreadParams | None = None) -> tuple[SpreadState, Observation]:
-        """Agents and landmarks uniform in the arena, agents at rest."""
+        """Place agents and landmarks uniform in the arena, agents at rest."""
         params = self.default_params() if params is None else params
         state = self._place(typed_keys(key), params)
         return state, self.observe(state, params)
@@ -142,12 +144,12 @@ class Spread(SpreadSettings, Environment):
         keys: Key[Array, " E"] | UInt32[Array, "E _"],
         params: SpreadParams | None = None,
     ) -> tuple[SpreadState, TimeStep]:
-        """What `step` is for each of E copies [E, …], to rounding; several times as fast as mapping it."""
+        """Return what `step` is for each of E copies [E, …], to rounding; several times as fast as mapping it."""
         last_state, last_action = _copies_last((state, action))
         return _copies_first(self.step(last_state, last_action, keys, params))
 
     def observe_many(self, state: SpreadState, params: SpreadParams | None = None) -> Observation:
-        """What `observe` is for each of E copies [E, …]."""
+        """Return what `observe` is for each of E copies [E, …]."""
         params = self.default_params() if params is None else params
         return _copies_first(self.observe(_copies_last(state), params))
 
@@ -158,7 +160,7 @@ class Spread(SpreadSettings, Environment):
         key: Key[Array, "*e"] | UInt32[Array, "*e _"],
         params: SpreadParams | None = None,
     ) -> tuple[SpreadState, TimeStep]:
-        """One step of the world. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
+        """Move the world by one step. action: [N] indices, or [N, 5] in [0, 1] with continuous actions."""
         params = self.default_params() if params is None else params
         before = state
         state = self._move(state, action, params)
@@ -200,14 +202,14 @@ class Spread(SpreadSettings, Environment):
         return one(state.positions, state.landmarks)
 
     def rewards(self, state: SpreadState, params: SpreadParams) -> Float[Array, "N *e"]:
-        """MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
+        """Return MPE2's reward of each agent: its own collisions, and everyone's distance to the landmarks."""
         _, to_landmarks = pairwise_offsets(state.positions, state.landmarks)
         shared = -_masked(_over_agents(to_landmarks, params), params.landmark_mask).sum(0)
         own = -params.collision_penalty * _touching(state.positions, params).sum(1)
         return own * params.local_ratio + shared[None] * (1 - params.local_ratio)
 
     def observe(self, state: SpreadState, params: SpreadParams) -> Observation:
-        """What each agent sees, in MPE2's order, and the exact state for central critics and oracles.
+        """Return what each agent sees, in MPE2's order, and the exact state for central critics and oracles.
 
         Whatever stands in the place of padding is 0.
         """
@@ -244,7 +246,7 @@ class Spread(SpreadSettings, Environment):
         )
 
     def from_features(self, features: Float[Array, "N O"]) -> Observation:
-        """The observation around bare feature vectors, as other simulators hand them out.
+        """Return the observation around bare feature vectors, as other simulators hand them out.
 
         Positions stand in the features; the exact state is not known.
         """
@@ -257,7 +259,7 @@ class Spread(SpreadSettings, Environment):
         )
 
     def entities(self, observation: Observation) -> Entities:
-        """What the features say, thing by thing, without where the origin lies: an agent's own is its velocity.
+        """Return what the features say, thing by thing, without where the origin lies: an agent's own is its velocity.
 
         MPE2 pads with zeros: what is at distance 0 is not there.
         """
@@ -288,7 +290,7 @@ class Spread(SpreadSettings, Environment):
         return NUM_SYMMETRIES
 
     def turn(self, observation: Observation, symmetry: Int[Array, ""]) -> Observation:
-        """The observation of the turned world: all that it holds are vectors in the plane."""
+        """Return the observation of the turned world: all that it holds are vectors in the plane."""
         return observation._replace(
             features=turn_vectors(observation.features, symmetry),
             positions=None if observation.positions is None else turn_vectors(observation.positions, symmetry),
@@ -296,11 +298,11 @@ class Spread(SpreadSettings, Environment):
         )
 
     def turn_action(self, action: Array, symmetry: Int[Array, ""]) -> Array:
-        """The action that does in the turned world what this one does here."""
+        """Return the action that does in the turned world what this one does here."""
         return turn_action(action, symmetry, self.continuous_actions)
 
     def measure(self, state: SpreadState, params: SpreadParams) -> dict[str, Float[Array, "*e"]]:
-        """The measurements of one step; `gacrl.evaluation.metrics` turns them into an episode's.
+        """Return the measurements of one step; `gacrl.evaluation.metrics` turns them into an episode's.
 
         Distances in arena units; coverages are fractions of the landmarks that have an agent within the
         radius in the name; `collisions` counts touching pairs, `near_agents` is the fraction of agents with
@@ -384,12 +386,12 @@ def reflect(
 
 
 def pack_state(state: SpreadState) -> Float[Array, "S *e"]:
-    """The global state as one vector: S = 4 N + 4 L."""
+    """Return the global state as one vector: S = 4 N + 4 L."""
     return jnp.concatenate([part.reshape(-1, *state.clock.shape) for part in state[:4]])
 
 
 def unpack_state(packed: Float[Array, " S"], num_agents: int) -> SpreadState:
-    """The inverse of `pack_state`; the clock is not in it and reads 0."""
+    """Return the inverse of `pack_state`; the clock is not in it and reads 0."""
     agents, landmarks = packed[: 4 * num_agents], packed[4 * num_agents :]
     positions, velocities = agents.reshape(2, num_agents, 2)
     places, headings = landmarks.reshape(2, -1, 2)

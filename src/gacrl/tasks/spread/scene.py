@@ -9,7 +9,7 @@ from gacrl.tasks.spread.settings import SpreadSettings
 
 
 def scene(settings: SpreadSettings, state: SpreadState, params: SpreadParams) -> Scene:
-    """The moment of one environment. Lengths in arena units."""
+    """Return the moment of one environment. Lengths in arena units."""
     _, distance = pairwise_offsets(state.positions, state.landmarks)
     if params.agent_mask is not None:
         distance = jnp.where(params.agent_mask[:, None], distance, jnp.inf)

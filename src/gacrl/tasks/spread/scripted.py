@@ -114,7 +114,7 @@ def _planner(
 
 
 def local(env: Spread) -> Actor:
-    """Each agent decides anew in every step, from the nearest landmarks and agents alone."""
+    """Let each agent decide anew in every step, from the nearest landmarks and agents alone."""
 
     def policy(memory: Memory, observation: Observation, key: PRNGKey):
         if observation.state is None:

@@ -16,7 +16,7 @@ def paper_shaped_reward(
     collision_term: CollisionTerm = "per_agent",
     agent_mask: Bool[Array, " N"] | None = None,
 ) -> Float[Array, "*e"]:
-    """Equation (1): the team's reward of one step.
+    """Compute equation (1): the team's reward of one step.
 
     raw: r_raw, the mean over agents of MPE2's reward. landmark_distance: d_min,i, from each agent to its
     nearest landmark. agent_distance: d_agent,i, to its nearest agent (infinity where there is none).

@@ -19,22 +19,22 @@ from gacrl.tasks.task import Case, Part, Task, Words
 
 
 def make(settings: SpreadSettings) -> Spread:
-    """The environment of these settings."""
+    """Make the environment of these settings."""
     return Spread(**vars(settings))
 
 
 def params(settings: SpreadSettings, gamma: float, padded: bool) -> SpreadParams:
-    """The task's numbers; with masks where agents join while it is learned."""
+    """Return the task's numbers; with masks where agents join while it is learned."""
     return params_of(settings, gamma, padded or ragged(settings))
 
 
 def ragged(settings: SpreadSettings) -> bool:
-    """Whether agents may be absent: those that join later."""
+    """Return whether agents may be absent: those that join later."""
     return settings.num_agents_start is not None
 
 
 def difficulty(settings: SpreadSettings, params: SpreadParams, share: Float[Array, ""]) -> SpreadParams:
-    """The task on its way from start to end: in a straight line.
+    """Return the task on its way from start to end: in a straight line.
 
     The paper's: local ratio and θ. Agents that join do so at once, where they happen to be: the environments share
     their parameters.

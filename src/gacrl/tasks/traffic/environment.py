@@ -30,11 +30,15 @@ NOBODY = -1
 
 
 class TrafficParams(NamedTuple):
+    """The number of the task that difficulty moves."""
+
     arrival: Float[Array, ""] | float
     """Probability that a car arrives at an entry in a step."""
 
 
 class TrafficState(NamedTuple):
+    """The cars, a slot each."""
+
     there: Bool[Array, " N"]
     """Whether a slot holds a car."""
     route: Int[Array, " N"]
@@ -78,7 +82,7 @@ class TrafficJunction(TrafficSettings, Environment):  # pyright: ignore[reportIn
         return len(self.roads.routes) + len(self.roads.cells) + 1 + (2 * self.vision + 1) ** 2
 
     def default_params(self) -> TrafficParams:
-        """The level's numbers."""
+        """Return the level's numbers."""
         return TrafficParams(jnp.asarray(LEVELS[self.level].arrival, float))
 
     def reset(self, key: PRNGKey, params: TrafficParams | None = None) -> tuple[TrafficState, Observation]:
