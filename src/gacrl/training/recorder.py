@@ -89,7 +89,7 @@ class RunFolder:
     def config(self) -> RunConfig:
         """Read the settings that the run was started with. Raises UserError, also for a task that is not at hand."""
         try:
-            return configuration.load(self.config_file)
+            return configuration.load(self.config_file, RunConfig())  # a setting that came later is at its default
         except ConfigError as error:
             name = self._task_that_is_missing()
             if name is not None:
