@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -11,34 +11,27 @@ import jax
 
 from gacrl import play, tasks
 from gacrl.config.checks import require
-from gacrl.envs.environment import Environment, EnvParams
+from gacrl.envs.environment import EnvParams
 from gacrl.errors import UserError
 from gacrl.evaluation import references
 from gacrl.export.html import UNBOUNDED
 from gacrl.export.replays import STEPS
+from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
 from gacrl.tasks.task import Task
 from gacrl.training import build
 from gacrl.training.devices import one_seed
 from gacrl.training.trainer import AbstractTrainer
-from gacrl.types import Learner, Memory, Policy
+from gacrl.types import Learner, Policy
 from gacrl.viewer.requests import Bounds
-from gacrl.viewer.rooms import Room
+from gacrl.viewer.rooms import Customs, Playable, Room
 
-_LADDER = (8, 32)
+_LADDER = (32,)
 """Places of the rooms for other numbers of agents than the task's own; the largest has the most that may come."""
 
 Change = Callable[[Any], Any]
 Warn = Callable[[str], None]
-
-
-class Playable(NamedTuple):
-    """A policy in an environment, apart from its parameters."""
-
-    env: Environment
-    policy: Callable[[Learner], Policy]
-    memory: Memory
 
 
 class Player:
@@ -50,6 +43,10 @@ class Player:
         """make: settings of the task -> the policy in it."""
         self.name, self.task, self.settings, self._make = name, task, settings, make
         self.learner, self.env_steps = learner, 0
+        self.sampled = False
+        """It draws what it does."""
+        self.draws = False
+        """Its head says how likely each action is, and not what it is worth."""
         self.opened: TrainedRun | None = None
         """None for a scripted policy."""
         self.nearest: int | None = None
@@ -102,17 +99,15 @@ class Player:
 
     def _furnished(self, places: int) -> Room:
         settings, task = self.sized(places), self.task
-        env, policy, memory = self._make(settings)
-        reach = self.reach is not None and task.team is not None
-        room = Room(
-            env=env,
-            policy=policy,
-            memory=memory,
+        customs = Customs(
             look=references.look_of(task, settings),
             measures=tuple(dict.fromkeys(self.measures.values())),
             edit=task.edit,
-            reach=reach,
+            join=None if task.team is None else partial(task.team.join, settings),
+            reach=self.reach is not None and task.team is not None,
+            nearest=self.nearest,
         )
+        room = Room(self._make(settings), customs)
         room.measure(self.learner, self.params(places, places))
         return room
 
@@ -243,10 +238,15 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
         def policy(numbers: Learner) -> Policy:
             return algorithm.policy(jax.tree.unflatten(structure, numbers), sampled)
 
-        return Playable(env, policy, trainer.memory)
+        def network(numbers: Learner) -> AgentNetwork:
+            assert algorithm.network is not None
+            return algorithm.network(jax.tree.unflatten(structure, numbers))
+
+        return Playable(env, policy, trainer.memory, None if algorithm.network is None else network)
 
     player = Player(name, opened.task, opened.config.env, make, acting(opened))
-    player.opened, player.env_steps = opened, opened.env_steps
+    player.opened, player.env_steps, player.sampled = opened, opened.env_steps, sampled
+    player.draws = opened.trainer.algorithm.draws
     network = getattr(opened.config.algorithm, "network", None)
     if network is not None:
         player.nearest, player.reach = network.nearest_agents, network.radius
@@ -259,8 +259,8 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
 
 
 def acting(opened: TrainedRun) -> list[jax.Array]:
-    """Return the numbers with which the first seed acts."""
-    return jax.tree.leaves(one_seed(opened.learners, 0))
+    """Return the numbers with which the first seed acts, as they are without a mesh of devices."""
+    return jax.device_put(jax.device_get(jax.tree.leaves(one_seed(opened.learners, 0))))
 
 
 def _acts(trainer: AbstractTrainer) -> Learner:

@@ -35,6 +35,7 @@ def page_data(cast: Cast) -> dict[str, Any]:
                 "communication": "some" if bounds.rounds else "none",
                 "rounds": bounds.rounds,
                 "vocabulary": bounds.vocabulary,
+                "draws": first.draws,
             }
         },
         "facts": {

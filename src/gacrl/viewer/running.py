@@ -1,11 +1,16 @@
 """A live page from its names to its end: the socket, the server, and what goes on beside it."""
 
+import contextlib
+import os
 import secrets
 import socket
+import sys
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import pairwise, zip_longest
 
 import uvicorn
 
@@ -16,8 +21,7 @@ from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
 
-_FIRST_PICTURE = 30.0
-"""Seconds that the compiler waits for a visitor, who would otherwise wait for it."""
+_LOWEST = 19
 
 
 def new_token() -> str:
@@ -107,22 +111,32 @@ class Running:
 def warm_up(cast: Cast) -> None:
     """Compile what the first picture needs."""
     for player in cast.players:
-        player.room(player.home).warm(player.learner, player.params(player.home, player.home))
+        deque(player.room(player.home).warm(player.learner, player.params(player.home, player.home)), maxlen=0)
 
 
-def warm_up_the_rest(cast: Cast, shown: threading.Event) -> None:
-    """Compile the rooms for other numbers of agents, smallest first, once a first picture is shown."""
-    shown.wait(_FIRST_PICTURE)
+def warm_up_the_rest(cast: Cast) -> None:
+    """Compile the rooms for other numbers of agents: first of each what answers a visitor who asks for it."""
     least, most = cast.bounds.least, cast.bounds.most
-    for player in cast.players if least < most else ():
-        for size in player.sizes[1:]:
-            player.room(size).warm(player.learner, player.params(size, size))
-            if size >= most:
-                break
+    under_way = [
+        player.room(size).warm(player.learner, player.params(size, size))
+        for player in (cast.players if least < most else ())
+        for smaller, size in pairwise(player.sizes)
+        if smaller < most
+    ]
+    for _ in zip_longest(*under_way):  # the first part of each, then the second
+        pass
 
 
-def beside(work: Callable[[], None]) -> threading.Thread:
-    """Do something in a thread that ends with the process."""
-    thread = threading.Thread(target=work, daemon=True)
+def beside(*work: Callable[[], None]) -> threading.Thread:
+    """Do some things in a thread that ends with the process, at the lowest priority where the system has one."""
+
+    def one_by_one() -> None:
+        with contextlib.suppress(AttributeError, OSError):  # on Linux a thread has a priority of its own
+            if sys.platform == "linux":
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOWEST)
+        for each in work:
+            each()
+
+    thread = threading.Thread(target=one_by_one, daemon=True)
     thread.start()
     return thread

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import json
 import sys
-import threading
 import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -145,8 +144,6 @@ class Server:
         self._page = page
         self._stage = ThreadPoolExecutor(1, "stage")
         self.visitors = 0
-        self.shown = threading.Event()
-        """Somebody has seen a frame."""
         routes = [
             Route("/", self._get_page),
             Route("/favicon.ico", lambda request: Response(status_code=204)),
@@ -196,7 +193,6 @@ class Server:
                 text = await self._played(visit)
                 if text is not None:
                     await self._send(socket, text)
-                    self.shown.set()
                 continue
             visit.news.clear()
             if not (visit.waits or visit.refusal):

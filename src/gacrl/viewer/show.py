@@ -101,7 +101,7 @@ class Lane:
         seen = jax.device_get(decided._replace(memory=()))
         if t == 0:
             self.size = float(np.ptp(seen.scene.agents.positions, axis=0).max(initial=0.0)) / 20
-        shown = picture(seen, now, meddling, player.nearest, self.size)
+        shown = picture(seen, now, meddling, self.size)
         shown |= {"earned": round(earned, 4), "measured": measured, "over": over, "count": now}
         return Moment(room, places, now, stood.state, decided, seen.messages, earned, measured, over, shown)
 
@@ -126,13 +126,11 @@ class Lane:
 
     def _resized(self, stood: Stood, places: int, count: int, now: int, t: int) -> tuple[int, Stood]:
         """Let agents come or go, in a larger room where this one has too few places."""
-        player, team, scene = self.player, self.player.task.team, self.scene
-        assert team is not None and scene is not None, "only a task with a team has agents that come and go"
+        player, scene = self.player, self.scene
+        assert scene is not None, "a lane takes a scene first"
         wider = places if places >= now and places != player.home else player.places_beside(now)
         room, params = player.room(wider), player.params(wider, now)
-        fresh = room.fresh(params, scene.seed, t)
-        state = team.join(player.sized(wider), grown(stood.state, fresh), fresh, count, now)
-        return wider, room.entered(params, state)
+        return wider, room.joined(params, stood.state, count, now, scene.seed, t)
 
     def _meddling(self, rules: Standing, t: int, places: int) -> Meddling | None:
         """Return what happens to the words of step t, in numbers."""
@@ -215,16 +213,6 @@ class Show:
 def untouched(scene: Scene) -> tuple[Event, ...]:
     """Return what was done to a scene, without what was done to words and edges."""
     return tuple(event for event in scene.events if event.kind not in _MEDDLING)
-
-
-def grown(state: EnvState, fresh: EnvState) -> EnvState:
-    """Return a state at the beginning of a larger one's arrays."""
-
-    def grow(old: Any, new: Any) -> Any:
-        corner = tuple(slice(0, size) for size in np.shape(old))
-        return old if np.shape(old) == np.shape(new) else new.at[corner].set(old)
-
-    return jax.tree.map(grow, state, fresh)
 
 
 def _hand(here: Sequence[Event], places: int, count: int, room: Room, stood: Stood) -> Edit | None:

@@ -52,6 +52,15 @@ class Neighbourhood(NamedTuple):
         return jnp.broadcast_to(jnp.eye(num_agents), (num_agents, count, num_agents))
 
 
+class Weighed(NamedTuple):
+    """How words came about and what they were worth to who heard them: for whoever looks on, no learner reads it."""
+
+    shares: Float[Array, "R N K"]
+    """Attention that each agent pays to its K speakers in each round; 0 of those that it does not hear."""
+    logits: Float[Array, "R N V"] | None = None
+    """Of the symbols that each agent could send; None where words are no symbols."""
+
+
 class Spoken(NamedTuple):
     """What came of a step's conversation."""
 
@@ -64,6 +73,8 @@ class Spoken(NamedTuple):
     """Of the symbols sent, in nats, mean over the rounds."""
     loss: Float[Array, " N"] | None = None
     """The kind's own, for each agent: its mean is added to what every learner minimises. None: it has none."""
+    weighed: Weighed | None = None
+    """None for a kind without attention."""
 
 
 class Communication(eqx.Module):
