@@ -103,7 +103,7 @@ def test_agents_come_and_go_and_a_radius_silences(quick_start: None):
     """A team that grows in the middle of an episode goes on from where it stood, and plays as one that began so large."""
     cast = cast_of("pretrained:gacrl-teams")
     player, show = cast.players[0], Show(cast)
-    assert cast.bounds[:2] == (1, 100) and player.sizes == (5, 8, 32, 100)
+    assert cast.bounds[:2] == (1, 100) and player.sizes == (5, 32, 100)
     show.take(Scene(1, 5, (Event(4, "add"), Event(4, "add"), Event(6, "remove"))))
     before, after, fewer = (show.frame(t)["main"] for t in (3, 4, 6))
     assert (before["count"], after["count"], fewer["count"]) == (5, 7, 6)

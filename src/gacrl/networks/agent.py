@@ -142,9 +142,7 @@ class AgentNetwork(eqx.Module):
         messages = spoken.messages
         if messages is not None:
             messages = jnp.where(observation.agent_mask[:, None], messages, 0.0)
-        hidden, gaze = (
-            (spoken.hidden, None) if self.look is None else self.look(spoken.hidden, seen.looked)
-        )
+        hidden, gaze = (spoken.hidden, None) if self.look is None else self.look(spoken.hidden, seen.looked)
         output = AgentOutput(
             head=self.head(hidden),
             hidden=hidden,

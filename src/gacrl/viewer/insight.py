@@ -1,7 +1,7 @@
 """How a network came to a decision: whom its agents heeded, what else they could have said, what they saw.
 
-The network is asked once more for what it weighed on the way, in the same program: the compiler finds that most of it is
-computed already. Things are named by their place in the picture of the moment.
+The network is asked once more for what it weighed on the way, in the same program: the compiler finds that most of it
+is computed already. Things are named by their place in the picture of the moment.
 """
 
 from typing import Any, NamedTuple
@@ -147,7 +147,7 @@ def _named(rank: Float[Array, "N M"], offsets: Float[Array, "N M 2"], scene: Sce
         return Named(jnp.full((rank.shape[0], 0), -1), jnp.zeros((rank.shape[0], 0)))
     value, chosen = jax.lax.top_k(rank, size)
     at = scene.agents.positions[:, None] + jnp.take_along_axis(offsets, chosen[..., None], axis=1)
-    away = jnp.square(at[:, :, None] - things.positions).sum(-1)
-    away = jnp.where(things.there, away, jnp.inf)
+    away = jnp.square(at[:, :, None] - things.positions[None, None]).sum(-1)
+    away = jnp.where(things.there[None, None], away, jnp.inf)
     found = jnp.isfinite(value) & (away.min(-1) < _SAME**2)
     return Named(jnp.where(found, away.argmin(-1), -1), value)

@@ -12,9 +12,7 @@ from gacrl.viewer.insight import Insight
 from gacrl.viewer.rooms import Decided, Meddling
 
 
-def picture(
-    decided: Decided, count: int, meddling: Meddling | None, size: float
-) -> dict[str, Any]:
+def picture(decided: Decided, count: int, meddling: Meddling | None, size: float) -> dict[str, Any]:
     """Write down what was decided in one environment, on the host: the first `count` agents are there.
 
     size: the radius of agents without one.

@@ -31,6 +31,8 @@ from gacrl.viewer.show import Show
 MOST_VISITORS = 8
 PATIENCE = 20.0
 """Seconds that a visitor may take to take what is sent."""
+_SLICE = 0.1
+"""Seconds after which a visitor who jumped far ahead lets the others have their turn."""
 _A_SECOND, _AT_ONCE = 100.0, 200.0
 """Messages that a visitor may send, and how many of them in a burst."""
 _HEADERS = {
@@ -108,13 +110,15 @@ class Visit:
         return self._frames is not None
 
     def play(self) -> str | None:
-        """Play the next frame that is asked for, and return it as text; None where it is not wanted any more."""
+        """Play toward the next frame that is asked for, and return it as text; None where it is not there yet."""
         wanted, frames = self._wanted, self._frames
         if wanted is None or frames is None:
             return None
         if wanted.version != self._version:
             self.show.take(wanted.scene)
             self._version = wanted.version
+        if not self.show.toward(frames.first, _SLICE):
+            return None
         shown = self.show.frame(frames.first)
         if self._frames is frames:
             rest = frames._replace(first=frames.first + 1)

@@ -4,6 +4,8 @@ A scene is a seed and a list of what was done at which step, so that everything 
 up to the first step that changed, and the rest is played again when it is asked for.
 """
 
+import math
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -78,9 +80,27 @@ class Lane:
 
     def through(self, t: int) -> Moment:
         """Return step t, or the last one of an episode that is over before."""
-        while len(self.moments) <= t and not (self.moments and self.moments[-1].over):
+        while not self.knows(t):
             self.moments.append(self._next())
         return self.moments[min(t, len(self.moments) - 1)]
+
+    def toward(self, t: int, ends: float) -> bool:
+        """Play on to step t until the clock says `ends`; returns whether it is there."""
+        if self._elsewhere is not None and self._scrambled(t) and not self._elsewhere.toward(t, ends):
+            return False
+        while not self.knows(t):
+            self.moments.append(self._next())
+            if time.monotonic() > ends:
+                break
+        return self.knows(t)
+
+    def knows(self, t: int) -> bool:
+        """Return whether step t is played, or the episode is over before."""
+        return len(self.moments) > t or bool(self.moments and self.moments[-1].over)
+
+    def _scrambled(self, t: int) -> bool:
+        events = () if self.scene is None else self.scene.events
+        return any(event.fate is not None and event.fate.kind == "scramble" for event in events if event.at <= t)
 
     def _next(self) -> Moment:
         scene, player, t = self.scene, self.player, len(self.moments)
@@ -198,16 +218,30 @@ class Show:
 
         An episode that ends before is at its last step there.
         """
-        assert self.scene is not None, "a show takes a scene first"
-        main = self.main.through(t)
-        begins = next((event.at for event in self.scene.events if event.kind in _MEDDLING), None)
-        if not self._rivals and begins is None:
-            return {"t": t, "main": main.shown, "twin": None}
-        if not self._rivals and begins is not None:  # until then nothing was meddled with
+        self.toward(t)
+        twin = self.twin.through(t).shown if self._twinned else None
+        return {"t": t, "main": self.main.through(t).shown, "twin": twin}
+
+    def toward(self, t: int, patience: float = math.inf) -> bool:
+        """Play on to step t for so many seconds; returns whether it can be shown now. Ask again to go on."""
+        ends = time.monotonic() + patience
+        if not self.main.toward(t, ends) or not self._twinned:
+            return self.main.knows(t)
+        if not self._rivals:  # until then nothing was meddled with
             known = len(self.twin.moments)
-            self.twin.moments += self.main.moments[known:begins]
+            self.twin.moments += self.main.moments[known : self._begins]
             self.twin.size = self.main.size
-        return {"t": t, "main": main.shown, "twin": self.twin.through(t).shown}
+        return self.twin.toward(t, ends)
+
+    @property
+    def _begins(self) -> int | None:
+        """The step in which words or edges are meddled with for the first time."""
+        assert self.scene is not None, "a show takes a scene first"
+        return next((event.at for event in self.scene.events if event.kind in _MEDDLING), None)
+
+    @property
+    def _twinned(self) -> bool:
+        return self._rivals or self._begins is not None
 
 
 def untouched(scene: Scene) -> tuple[Event, ...]:
