@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 
@@ -24,12 +24,14 @@ from gacrl.training import build
 from gacrl.training.devices import one_seed
 from gacrl.training.trainer import AbstractTrainer
 from gacrl.types import Learner, Policy
+from gacrl.viewer.hosted import HostRoom
 from gacrl.viewer.requests import Bounds
 from gacrl.viewer.rooms import Customs, Playable, Room
 
 _LADDER = (32,)
 """Places of the rooms for other numbers of agents than the task's own; the largest has the most that may come."""
 
+AnyRoom: TypeAlias = Room | HostRoom
 Change = Callable[[Any], Any]
 Warn = Callable[[str], None]
 
@@ -57,7 +59,7 @@ class Player:
         """Agents that it can play with at the most; None: the task says."""
         self.vocabulary = 0
         """Symbols that it says; 0 for one that says none."""
-        self._rooms: dict[int, Room] = {}
+        self._rooms: dict[int, AnyRoom] = {}
         self._params: dict[tuple[int, int], EnvParams] = {}
         self._making = Lock()
         self.home = int(task.make(settings).num_agents)
@@ -88,7 +90,7 @@ class Player:
             return (self.home,)
         return self.home, *(size for size in _LADDER if size < most), most
 
-    def room(self, places: int) -> Room:
+    def room(self, places: int) -> AnyRoom:
         """Return the room of that size; nobody waits for one that is there while another is made."""
         if (found := self._rooms.get(places)) is not None:
             return found
@@ -97,7 +99,7 @@ class Player:
                 self._rooms[places] = self._furnished(places)
             return self._rooms[places]
 
-    def _furnished(self, places: int) -> Room:
+    def _furnished(self, places: int) -> AnyRoom:
         settings, task = self.sized(places), self.task
         customs = Customs(
             look=references.look_of(task, settings),
@@ -107,7 +109,8 @@ class Player:
             reach=self.reach is not None and task.team is not None,
             nearest=self.nearest,
         )
-        room = Room(self._make(settings), customs)
+        playable = self._make(settings)
+        room = (HostRoom if playable.env.hosted else Room)(playable, customs)
         room.measure(self.learner, self.params(places, places))
         return room
 
@@ -194,7 +197,7 @@ def _only_scripted(name: str) -> bool:
 def _require_shown(task: Task, settings: Any) -> None:
     env = task.make(settings)
     if env.hosted:
-        raise UserError(f"{task.name} lives in Python, where a page cannot step it: `gacrl render` records it")
+        return  # it draws itself, or says later that it cannot
     seen = jax.eval_shape(env.reset, jax.random.key(0), task.numbers(settings, env))[1]
     if task.scene is None and seen.positions is None:
         raise UserError(f"{task.name} does not say where things are: give its observations positions, or a scene")

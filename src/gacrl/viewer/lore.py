@@ -18,8 +18,9 @@ _EVERY = 5.0
 def keep_telling(cast: Cast, board: Board) -> None:
     """Put yardsticks on the board, then the dictionary of the first policy, and a new one for newer parameters."""
     player = cast.players[0]
-    if not cast.task.make(cast.settings).hosted:
-        board.put("known", yardsticks=_yardsticks(player))
+    if player.task.make(player.settings).hosted:
+        return  # Python would play for minutes, and nobody knows where things are
+    board.put("known", yardsticks=_yardsticks(player))
     counted: Any = None
     while player.opened is not None:
         if player.opened is not counted:

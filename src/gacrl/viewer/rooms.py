@@ -38,6 +38,18 @@ class Meddling(NamedTuple):
     radius: Float[Array | np.ndarray, ""] | float
     """Within which agents hear each other, where the task has space and the network a radius."""
 
+    @classmethod
+    def none(cls, words: tuple[int, int, int]) -> "Meddling":
+        """Let everything arrive as it is said: [R, N, V] of it."""
+        rounds, agents, _ = words
+        return cls(
+            values=np.zeros(words, np.float32),
+            replaced=np.zeros((rounds, agents), bool),
+            other=np.arange(agents),
+            kept=np.ones((agents, agents), bool),
+            radius=0.0,
+        )
+
 
 class Stood(NamedTuple):
     """Where an environment stands before its agents decide."""
@@ -149,6 +161,9 @@ class Room:
         """Let the agents decide in step t."""
         return self._decide(learner, params, stood.state, stood.seen, stood.memory, stood.first, seed, t, meddling)
 
+    def drawn(self, state: EnvState) -> None:
+        """Return nothing: the page draws the scene."""
+
     def measure(self, learner: Learner, params: EnvParams) -> None:
         """Find out how much there is to see and to hear; nothing is computed."""
         stood = jax.eval_shape(self._reset, params, 0)
@@ -168,15 +183,7 @@ class Room:
         yield
         stood, _ = self.step(params, stood.state, decided, 0, 0)
         if self.words is not None:
-            rounds, agents, _ = self.words
-            meddling = Meddling(
-                values=np.zeros(self.words, np.float32),
-                replaced=np.zeros((rounds, agents), bool),
-                other=np.arange(agents),
-                kept=np.ones((agents, agents), bool),
-                radius=0.0,
-            )
-            self.decide(learner, params, stood, 0, 1, meddling)
+            self.decide(learner, params, stood, 0, 1, Meddling.none(self.words))
         if self._edit is not None:
             placed = (
                 Placed(np.zeros((count, 2), np.float32), np.zeros(count, bool))

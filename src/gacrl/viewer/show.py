@@ -15,10 +15,10 @@ import numpy as np
 from gacrl.envs.environment import EnvState
 from gacrl.scene import Edit, Placed
 from gacrl.types import Learner
-from gacrl.viewer.cast import Cast, Player
+from gacrl.viewer.cast import AnyRoom, Cast, Player
 from gacrl.viewer.pictures import picture
 from gacrl.viewer.requests import MOST_SEED, Event, Scene, Standing, first_difference, standing
-from gacrl.viewer.rooms import Decided, Meddling, Room, Stood
+from gacrl.viewer.rooms import Decided, Meddling, Stood
 
 _MEDDLING = ("fate", "radius", "cut")
 """What is done to words and edges. Everything else happens in the untouched run as well."""
@@ -33,7 +33,7 @@ LOST = 0.5
 class Moment(NamedTuple):
     """What is kept of a step."""
 
-    room: Room
+    room: AnyRoom
     places: int
     team: int
     """Agents that are there."""
@@ -123,6 +123,8 @@ class Lane:
             self.size = float(np.ptp(seen.scene.agents.positions, axis=0).max(initial=0.0)) / 20
         shown = picture(seen, now, meddling, self.size)
         shown |= {"earned": round(earned, 4), "measured": measured, "over": over, "count": now}
+        drawn = room.drawn(stood.state)
+        shown |= {} if drawn is None else {"drawn": drawn}
         return Moment(room, places, now, stood.state, decided, seen.messages, earned, measured, over, shown)
 
     def _stepped(self, scene: Scene, t: int) -> tuple[int, int, Stood, float, dict[str, float], bool]:
@@ -158,8 +160,9 @@ class Lane:
         if shape is None:
             return None
         rounds, agents, symbols = shape
-        values, replaced = np.zeros(shape, np.float32), np.zeros((rounds, agents), bool)
-        other, kept = np.arange(agents), np.ones((agents, agents), bool)
+        radius = (self.player.reach or 0.0) if rules.radius is None else rules.radius
+        meddling = Meddling.none(shape)._replace(radius=float(radius))
+        values, replaced, other, kept, _ = meddling
         for one, two in rules.cuts:
             if max(one, two) < agents:
                 kept[one, two] = kept[two, one] = False
@@ -181,8 +184,7 @@ class Lane:
                 for number, word in enumerate(fate.spoken[:rounds]):
                     if word < symbols:
                         values[number, agent, word], replaced[number, agent] = 1.0, True
-        radius = (self.player.reach or 0.0) if rules.radius is None else rules.radius
-        return Meddling(values, replaced, other, kept, float(radius))
+        return meddling
 
     @property
     def _seed(self) -> int:
@@ -249,7 +251,7 @@ def untouched(scene: Scene) -> tuple[Event, ...]:
     return tuple(event for event in scene.events if event.kind not in _MEDDLING)
 
 
-def _hand(here: Sequence[Event], places: int, count: int, room: Room, stood: Stood) -> Edit | None:
+def _hand(here: Sequence[Event], places: int, count: int, room: AnyRoom, stood: Stood) -> Edit | None:
     """Return what a hand moves in a step, the last place of each thing; None where it moves nothing."""
     moves = [event for event in here if event.kind == "move"]
     if not moves:

@@ -188,7 +188,7 @@ function frameOf(shown) {
   };
   return {
     seen: shown.sees?.map((sees, i) => sightOf(sees, agents[i], agents, marks)),
-    scene: dressed(agents, marks, shown.lines, shown.ground), decision, share: shown.measured.share ?? shareLit(marks),
+    scene: { ...dressed(agents, marks, shown.lines, shown.ground), drawn: shown.drawn ?? null }, decision, share: shown.measured.share ?? shareLit(marks),
     totals: { return: shown.earned, collisions: 0, ...shown.measured },
   };
 }
