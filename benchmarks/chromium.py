@@ -26,11 +26,11 @@ def missing() -> str:
 
 @contextlib.contextmanager
 def opened() -> Generator[Any]:
-    """The browser of this machine, driven by Playwright's client."""
+    """The browser of this machine, driven by Playwright's client. A GPU that software plays makes frames come late."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path(), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=path(), args=["--no-sandbox", "--disable-gpu"])
         yield browser
         browser.close()
 

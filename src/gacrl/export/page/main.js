@@ -4,6 +4,7 @@ import { connect } from "./controls.js";
 import { byId, make, say } from "./elements.js";
 import { aboutWord } from "./explain.js";
 import { drawCurves, drawGauges } from "./gauges.js";
+import { NORMAL, SPEEDS } from "./habits.js";
 import { Inspector } from "./inspector.js";
 import { written } from "./link.js";
 import { open } from "./opening.js";
@@ -13,13 +14,12 @@ import { edgeName } from "./story.js";
 import { verdict } from "./verdict.js";
 import { Voices } from "./voices.js";
 
-const SPEEDS = [2, 5, 10, 25];  // steps a second
 const WORK = 7;  // milliseconds of each frame for steps to come
 const REST = 1800;  // milliseconds between an episode and the next one
 
 const page = JSON.parse(byId("data").textContent);
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-const still = { t: 0, playing: false, speed: 5, selected: null, hovered: null, held: null, over: 0 };
+const still = { t: 0, playing: false, speed: NORMAL, selected: null, hovered: null, held: null, over: 0 };
 
 const { session, asked } = await open(page);
 const view = new SceneView(byId("scene"), page.colours), twinView = new SceneView(byId("twin"), page.colours);

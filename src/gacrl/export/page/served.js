@@ -2,11 +2,11 @@
 
 import { dressed, shareLit } from "./dressing.js";
 import { byId, make, say } from "./elements.js";
+import { FIRST } from "./habits.js";
 import { drawLearning } from "./learning.js";
 import { understood } from "./link.js";
 import { MEDDLING, Story } from "./story.js";
 
-const OPENING = 3;  // the seed that opens a page
 const AHEAD = 24;  // frames that are asked for before they are shown
 const PACE = 40;  // milliseconds between two messages of a hand that drags
 const MOST = 64;  // frames in one message
@@ -18,7 +18,7 @@ export async function open(page) {
   const { facts } = page, world = { ...facts, add: facts.most > facts.least, remove: facts.most > facts.least };
   const policy = { settings: page.network.settings };
   const asked = understood(location.hash, world, policy);
-  const start = asked === null ? { seed: OPENING, count: facts.count } : { seed: asked.seed, count: asked.count };
+  const start = asked === null ? { seed: FIRST, count: facts.count } : { seed: asked.seed, count: asked.count };
   const session = new Served(page, world, policy, start, asked?.events ?? []);
   await session.opened;
   return { session, asked };
