@@ -122,9 +122,14 @@ class Player:
     @cached_property
     def measures(self) -> dict[str, str]:
         """What a page shows of each step besides the reward: {what it is called there: measurement}."""
-        world = self.task.world
-        known = None if world is None else world(self.task.make(self.settings), self.params(self.home, self.home))
-        return {} if known is None else {**known["measures"]}
+        return {**self.world.get("measures", {})}
+
+    @cached_property
+    def world(self) -> Mapping[str, Any]:
+        """The rules of the task, as an exported page has them; {} where it would know none."""
+        known = self.task.world
+        found = None if known is None else known(self.task.make(self.settings), self.params(self.home, self.home))
+        return {} if found is None else found
 
     def params(self, places: int, count: int) -> EnvParams:
         """Return the numbers of the task in the room of that size, with so many agents there."""

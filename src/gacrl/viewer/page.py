@@ -29,7 +29,7 @@ def page_data(cast: Cast) -> dict[str, Any]:
     return {
         **common(cast.task, cast.settings, " and ".join(names)),
         "measures": first.measures,
-        "world": {"num_agents": first.home},
+        "world": {**first.world, "num_agents": first.home},
         "network": {
             "settings": {
                 "communication": "some" if bounds.rounds else "none",

@@ -75,11 +75,9 @@ export function aboutWord(dictionary, agent, round, symbol, page) {
   const who = entry.agent < 0 ? "all agents" : `agent ${entry.agent}`;
   const start = `${letter(symbol)} in round ${round + 1}: ${percent(entry.share)} of what ${who} say${entry.agent < 0 ? "" : "s"} there.`;
   if (!entry.direction) return `${start} Nobody hears it.`;
-  const whom = entry.of === "heard" ? "Who hears it" : "Who says it";
-  const goal = entry.goal[0] >= 0 ? ` has to go to ${colourName(entry.goal[0])} (${percent(entry.goal[1])});` : "";
-  const place = entry.of === "heard" && goal ? "that lies" : `the nearest ${page.words.mark} lies`;
-  const where = COMPASS[entry.direction[0]];
-  return `${start} ${whom}${goal || ":"} ${place} ${where} most often (${percent(entry.direction[1])}), ${far(entry.distance)} away on average; `
+  const goal = entry.goal[0] >= 0 ? `Who hears it most often has to go to ${colourName(entry.goal[0])} (${percent(entry.goal[1])}). That` : "";
+  const place = entry.of === "heard" && goal ? `${goal} lies` : `For who ${entry.of === "heard" ? "hears" : "says"} it the nearest ${page.words.mark} lies`;
+  return `${start} ${place} ${COMPASS[entry.direction[0]]} (${percent(entry.direction[1])}), ${far(entry.distance)} away on average; `
     + `the next action is “${actionName(page, entry.action[0])}” (${percent(entry.action[1])}).`;
 }
 

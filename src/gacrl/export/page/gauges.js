@@ -13,11 +13,13 @@ export function drawGauges(page, session, t) {
   if (page.measures[COLLISIONS]) rows.push(["Collisions", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
   const comparable = session.start.count === page.world?.num_agents && main.scene.agents.length === session.start.count;
   const yardsticks = comparable ? names : [];
-  const head = ["", session.names?.main ?? (twin ? "Here" : "Now"), ...(twin ? [session.names?.twin ?? "Untouched"] : []), ...yardsticks];
-  const cells = rows.map(([label, of, measure, format]) => [
-    label, format(of(main)), ...(twin ? [format(of(twin))] : []),
-    ...yardsticks.map((name) => (t === 0 && measure !== "share" ? format(0) : known(page.yardsticks[name][measure], t, format))),
-  ]);
+  const head = ["", ...rows.map(([label]) => label)];
+  const lane = (name, frame) => [name, ...rows.map(([, of, , format]) => format(of(frame)))];
+  const cells = [
+    lane(session.names?.main ?? (twin ? "Here" : "Now"), main), ...(twin ? [lane(session.names?.twin ?? "Untouched", twin)] : []),
+    ...yardsticks.map((name) => [name, ...rows.map(([, , measure, format]) => (
+      t === 0 && measure !== "share" ? format(0) : known(page.yardsticks[name][measure], t, format)))]),
+  ];
   const table = byId("gauges"), text = JSON.stringify([head, cells]);
   if (table.dataset.shown === text) return;
   table.dataset.shown = text;

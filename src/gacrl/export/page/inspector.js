@@ -4,7 +4,8 @@ import { byId, make, say } from "./elements.js";
 import { aboutAgent, aboutWord, actionName, actionShares, actionValues, percent } from "./explain.js";
 import { letter } from "./palette.js";
 
-const LIKELY = 4;
+const LIKELY = 4;  // words
+const MOST = 8;  // actions
 
 export class Inspector {
   constructor(page, act) {
@@ -72,7 +73,9 @@ function scaled(values) {
 
 function bars(title, page, numbers, part, text) {
   if (numbers.size === 0) return [];
-  return [make("h3", {}, title), ...[...numbers].map(([action, value]) => bar(actionName(page, action), part(value), text(value)))];
+  const best = new Set([...numbers].sort((a, b) => b[1] - a[1]).slice(0, MOST).map(([action]) => action)), some = best.size < numbers.size;
+  const listed = [...numbers].filter(([action]) => best.has(action));
+  return [make("h3", {}, some ? `${title}: the best ${MOST} of ${numbers.size}` : title), ...listed.map(([action, value]) => bar(actionName(page, action), part(value), text(value)))];
 }
 
 function bar(name, value, text) {
