@@ -67,6 +67,33 @@ def test_it_plays_and_a_silenced_agent_costs_the_other_its_goal(reference: Site,
     visit.close()
 
 
+def test_it_says_what_an_agent_sees_and_says_and_what_is_found_out_later(reference: Site, browser: Any):
+    visit = LiveVisit(browser, reference.url, "#seed=3&n=2&at=9")
+    said = visit.at(9) and visit("gacrlPage.session.main.frames[9].decision.said.map(round => round[1])")
+    visit.press("a", "a")
+    visit.until("document.getElementById('about-name').textContent === 'Agent 1'")
+    about = visit.page.locator("#about").inner_text()
+    for part in ("Sees", "Must reach", "agent 0 (100\u00a0% of its attention)", "Then looks at", "looks worth"):
+        assert part in about
+    assert f"{chr(65 + said[0])} (" in about and "Means" not in about
+    assert visit.page.locator("#gauges tbody tr").count() == 1 and visit.page.locator("#dictionary").is_hidden()
+    word = {"agent": 1, "round": 0, "symbol": said[0], "of": "heard", "share": 0.5, "goal": [2, 0.75]}
+    word |= {"direction": [2, 0.5], "distance": 0.25, "action": [1, 0.4]}
+    reference.board.put("words", dictionary=[word], heard=1000)
+    reference.board.put(
+        "known", yardsticks={"told": {"return": [-1.0 * t for t in range(25)], "share": [0.5] * 25}}
+    )
+    visit.until("document.getElementById('about').textContent.includes('Means')")
+    assert (
+        "go to purple square (75\u00a0%). That lies above (50\u00a0%), 0.25 away"
+        in visit.page.locator("#about").inner_text()
+    )
+    assert "in 1,000 recorded episodes" in visit.page.locator("#heading").inner_text()
+    assert visit.page.locator("#gauges tbody").inner_text().split()[-4:] == ["told", "-8.0", "50", "%"]
+    reference.board.notes.clear()
+    visit.close()
+
+
 def test_dragged_landmarks_are_followed_and_thirty_agents_fit(teams: Site, browser: Any):
     visit = LiveVisit(browser, teams.url, "#seed=1&n=5&at=0")
     page = visit.page

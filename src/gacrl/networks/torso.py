@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.graph import attend, shares_of, with_length
+from gacrl.networks.graph import attend, with_length
 from gacrl.networks.layers import Linear, Mlp, Score, rectified
 from gacrl.types import Entities, Observation, PRNGKey
 
@@ -41,8 +41,8 @@ class Gaze(NamedTuple):
     """Where a second look went: for whoever looks on."""
 
     offsets: Float[Array, "N L 2"]
-    shares: Float[Array, "N L"]
-    """Attention that each agent pays to the landmark there."""
+    scores: Float[Array, "N L"]
+    """Whose softmax is the attention that each agent pays to the landmark there."""
 
 
 class MlpTorso(eqx.Module):
@@ -142,7 +142,7 @@ class SecondLook(eqx.Module):
         )
         score = jnp.where(there, score, -jnp.inf)
         merged = rectified(self.merge(jnp.concatenate([hidden, attend(places, score)], axis=-1)), self.slope)
-        return hidden + merged, Gaze(looked.offsets, shares_of(score))
+        return hidden + merged, Gaze(looked.offsets, score)
 
 
 class _Group(NamedTuple):

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentMemory, AgentNetwork, AgentOutput
-from gacrl.networks.graph import nearest_speakers
+from gacrl.networks.communication.base import Weighed
+from gacrl.networks.graph import nearest_speakers, shares_of
 from gacrl.scene import Discs, Scene
 from gacrl.types import Arrives, Memory, Observation
 
@@ -65,17 +66,18 @@ def insight(
     weighed, gaze = output.weighed, output.gaze
     speakers = heard_of(seen, output.adjacency, network.nearest)[1]
     words = chances = None
-    if weighed is not None and weighed.logits is not None:
-        chances, words = jax.lax.top_k(jax.nn.softmax(weighed.logits), min(NAMED, weighed.logits.shape[-1]))
+    if weighed is not None and weighed.logits:
+        likely = jax.nn.softmax(jnp.stack(weighed.logits))
+        chances, words = jax.lax.top_k(likely, min(NAMED, likely.shape[-1]))
     head = None
     if not env.continuous_actions:
         head = jnp.where(seen.action_mask, output.head, -jnp.inf)
     return Insight(
-        heeded=None if weighed is None else _spread(weighed.shares.mean(0), speakers),
+        heeded=None if weighed is None else _heeded(weighed, said, speakers),
         words=words,
         chances=chances,
         head=head,
-        looks=None if gaze is None else _named(gaze.shares, gaze.offsets, scene, scene.marks),
+        looks=None if gaze is None else _named(shares_of(gaze.scores), gaze.offsets, scene, scene.marks),
         **_in_sight(env, seen, scene),
     )
 
@@ -89,6 +91,24 @@ def heard_of(
     speakers = nearest_speakers(seen.positions, adjacency, nearest)
     listens = _spread(jnp.ones(speakers.shape, bool), speakers)
     return adjacency & listens, speakers
+
+
+def _heeded(
+    weighed: Weighed, said: Float[Array, "R N V"] | None, speakers: Int[Array, "N K"] | None
+) -> Float[Array, "N N"]:
+    """Return the shares of attention, the mean over the rounds; whoever said nothing in a round has none in it."""
+    rounds: list[Array] = []
+    for number, score in enumerate(weighed.scores):
+        if said is not None and weighed.logits:
+            spoke = said[number].sum(-1) > 0
+            heard = jnp.broadcast_to(spoke[None], score.shape) if speakers is None else spoke[speakers]
+            score = jnp.where(heard, score, -jnp.inf)
+        rounds.append(_spread(shares_of(score)[:, : _speakers_of(score, speakers)], speakers))
+    return jnp.stack(rounds).mean(0)
+
+
+def _speakers_of(score: Float[Array, "N S"], speakers: Int[Array, "N K"] | None) -> int:
+    return score.shape[0] if speakers is None else speakers.shape[1]
 
 
 def _spread(values: Array, speakers: Int[Array, "N K"] | None) -> Array:

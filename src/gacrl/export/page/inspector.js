@@ -5,7 +5,7 @@ import { aboutAgent, aboutWord, actionName, actionShares, actionValues, percent 
 import { letter } from "./palette.js";
 
 const LIKELY = 4;  // words
-const MOST = 8;  // actions
+const BEST = 8;  // actions
 
 export class Inspector {
   constructor(page, act) {
@@ -73,9 +73,9 @@ function scaled(values) {
 
 function bars(title, page, numbers, part, text) {
   if (numbers.size === 0) return [];
-  const best = new Set([...numbers].sort((a, b) => b[1] - a[1]).slice(0, MOST).map(([action]) => action)), some = best.size < numbers.size;
+  const best = new Set([...numbers].sort((a, b) => b[1] - a[1]).slice(0, BEST).map(([action]) => action)), some = best.size < numbers.size;
   const listed = [...numbers].filter(([action]) => best.has(action));
-  return [make("h3", {}, some ? `${title}: the best ${MOST} of ${numbers.size}` : title), ...listed.map(([action, value]) => bar(actionName(page, action), part(value), text(value)))];
+  return [make("h3", {}, some ? `${title}: the best ${BEST} of ${numbers.size}` : title), ...listed.map(([action, value]) => bar(actionName(page, action), part(value), text(value)))];
 }
 
 function bar(name, value, text) {

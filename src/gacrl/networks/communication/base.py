@@ -53,12 +53,15 @@ class Neighbourhood(NamedTuple):
 
 
 class Weighed(NamedTuple):
-    """How words came about and what they were worth to who heard them: for whoever looks on, no learner reads it."""
+    """How words came about and what they were worth to who heard them, for whoever looks on.
 
-    shares: Float[Array, "R N K"]
-    """Attention that each agent pays to its K speakers in each round; 0 of those that it does not hear."""
-    logits: Float[Array, "R N V"] | None = None
-    """Of the symbols that each agent could send; None where words are no symbols."""
+    A tuple has an entry for each round, as it was computed on the way: no learner reads them, and none pays for them.
+    """
+
+    scores: tuple[Float[Array, "N S"], ...]
+    """Whose softmax is the attention that each agent pays to its K speakers (and perhaps, behind them, to itself)."""
+    logits: tuple[Float[Array, "N V"], ...] = ()
+    """Of the symbols that each agent could send; () where words are no symbols."""
 
 
 class Spoken(NamedTuple):
