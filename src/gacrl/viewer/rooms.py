@@ -172,18 +172,22 @@ class Room:
         self.words = None if found.messages is None else found.messages.shape
 
     def warm(self, learner: Learner, params: EnvParams) -> Generator[None]:
-        """Compile all programs by playing a step, so that nobody waits for them later.
+        """Compile all programs by playing a step, so that nobody waits for them later: one after the other.
 
-        The first part is what answers a visitor who lets agents come; the second what goes on from there.
+        First what answers a visitor who lets agents come, then what goes on from there.
         """
         stood = self.reset(params, 0)
+        yield
         if self._join is not None:
             stood = self.joined(params, stood.state, self.places, self.places, 0, 0)
+            yield
         decided = self.decide(learner, params, stood, 0, 0, None)
         yield
         stood, _ = self.step(params, stood.state, decided, 0, 0)
+        yield
         if self.words is not None:
             self.decide(learner, params, stood, 0, 1, Meddling.none(self.words))
+            yield
         if self._edit is not None:
             placed = (
                 Placed(np.zeros((count, 2), np.float32), np.zeros(count, bool))

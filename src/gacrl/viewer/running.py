@@ -1,16 +1,14 @@
 """A live page from its names to its end: the socket, the server, and what goes on beside it."""
 
-import contextlib
-import os
 import secrets
 import socket
-import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import pairwise, zip_longest
+from itertools import chain, pairwise, zip_longest
 
 import uvicorn
 
@@ -21,7 +19,8 @@ from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
 
-_LOWEST = 19
+_POLITE = 0.02
+"""Seconds after which the compiler asks again whether somebody is being answered."""
 
 
 def new_token() -> str:
@@ -114,8 +113,12 @@ def warm_up(cast: Cast) -> None:
         deque(player.room(player.home).warm(player.learner, player.params(player.home, player.home)), maxlen=0)
 
 
-def warm_up_the_rest(cast: Cast) -> None:
-    """Compile the rooms for other numbers of agents: first of each what answers a visitor who asks for it."""
+def warm_up_the_rest(cast: Cast, busy: Callable[[], bool]) -> None:
+    """Compile the rooms for other numbers of agents: first of each what answers a visitor who asks for it.
+
+    busy: whether somebody is being answered, who goes first. (A thread of low priority would hold the interpreter's
+    lock for as long as the machine has other things to do, and everyone would wait for it.)
+    """
     least, most = cast.bounds.least, cast.bounds.most
     under_way = [
         player.room(size).warm(player.learner, player.params(size, size))
@@ -123,17 +126,15 @@ def warm_up_the_rest(cast: Cast) -> None:
         for smaller, size in pairwise(player.sizes)
         if smaller < most
     ]
-    for _ in zip_longest(*under_way):  # the first part of each, then the second
-        pass
+    for _ in chain.from_iterable(zip_longest(*under_way)):  # the first program of each, then the second
+        while busy():
+            time.sleep(_POLITE)
 
 
 def beside(*work: Callable[[], None]) -> threading.Thread:
-    """Do some things in a thread that ends with the process, at the lowest priority where the system has one."""
+    """Do some things, one after the other, in a thread that ends with the process."""
 
     def one_by_one() -> None:
-        with contextlib.suppress(AttributeError, OSError):  # on Linux a thread has a priority of its own
-            if sys.platform == "linux":
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOWEST)
         for each in work:
             each()
 

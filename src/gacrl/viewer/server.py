@@ -146,7 +146,7 @@ class Server:
         """page: the host of the socket -> the page."""
         self.cast, self.board = cast, Board() if board is None else board
         self._page = page
-        self._stage = ThreadPoolExecutor(1, "stage")
+        self._stage, self._answering = ThreadPoolExecutor(1, "stage"), 0
         self.visitors = 0
         routes = [
             Route("/", self._get_page),
@@ -154,6 +154,10 @@ class Server:
             WebSocketRoute("/live", self._live),
         ]
         self.app: ASGIApp = _Guarded(Starlette(routes=routes), guard)
+
+    def busy(self) -> bool:
+        """Return whether somebody waits for a frame."""
+        return self._answering > 0
 
     async def _get_page(self, request: HttpRequest) -> Response:
         return HTMLResponse(self._page(same_site(request.headers)))
@@ -205,12 +209,15 @@ class Server:
 
     async def _played(self, visit: Visit) -> str | None:
         """Play a frame in the thread of the stage; what a task's code raises is told to the visitor, and printed."""
+        self._answering += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._stage, visit.play)
         except UserError as error:
             says = str(error)
         except Exception as error:  # a task's own code may raise anything; the other visitors go on
             says = f"the task or the policy raised {type(error).__name__}: {error}"
+        finally:
+            self._answering -= 1
         print(f"gacrl: {says}", file=sys.stderr)
         visit.forget()
         return json.dumps({"kind": "error", "says": says})
