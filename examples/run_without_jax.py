@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-RADIUS, SHARPNESS, SLOPE = 1.5, 4.0, 0.1  # on the card: radius, look_sharpness, heard_slope
+RADIUS, SHARPNESS, SLOPE = 1.5, 4.0, 0.1  # on the card: radius, look_sharpness, seen_slope and heard_slope
 
 
 def linear(w, name, x):
@@ -55,10 +55,10 @@ def look(w, seen):
     mine = np.broadcast_to(scales(-landmarks)[:, :, None], between.shape)
     contest = mlp(w, "torso.rival", np.concatenate([between, mine], -1)).max(2)
     repeated = np.repeat(own[:, None], n, axis=1)
-    places = mlp(w, "torso.landmark", np.concatenate([repeated, scales(landmarks), contest], -1))
+    places = mlp(w, "torso.landmark", np.concatenate([repeated, scales(landmarks), contest], -1), SLOPE)
     chosen = attend(places, linear(w, "torso.attention", places)[..., 0])
     crowd = mlp(w, "torso.agent", np.concatenate([repeated[:, 1:], scales(agents)], -1)).max(1)
-    return mlp(w, "torso.out", np.concatenate([own, chosen, places.max(1), crowd], -1)), places
+    return mlp(w, "torso.out", np.concatenate([own, chosen, places.max(1).clip(0), crowd], -1)), places
 
 
 def decide(w, seen):

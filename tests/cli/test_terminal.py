@@ -172,5 +172,5 @@ def test_a_machine_that_fails_ends_the_doctor_with_a_sentence(
 def test_the_doctors_list_has_every_learner_once():
     asked = doctor.checks()
     learners = [check.what.partition(" ")[0] for check in asked if check.what.endswith("on the probes")]
-    assert learners == ["gacrl", "gacrl-talk", "qmix", "vdn", "iql", "mappo", "ippo", "commnet", "dial", "paper"]
+    assert learners == ["gacrl", "qmix", "vdn", "iql", "mappo", "ippo", "commnet", "dial", "paper"]
     assert np.isclose(sum(check.work for check in asked), 1 + len(learners))

@@ -352,3 +352,16 @@ def test_memory_is_there_where_the_task_needs_it_and_a_file_may_say_otherwise(fr
     assert on_task(preset("paper"), "later").algorithm == preset("paper").algorithm, "it has a network of its own"
     written = {"env": {"name": "later"}, "algorithm": {"network": {"recurrent": False}}}
     assert not from_dict(written, preset("ippo")).algorithm.network.recurrent  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_gacrl_has_a_told_critic_where_something_must_be_said_and_a_file_may_say_otherwise():
+    def critic(config: RunConfig) -> str:
+        return config.algorithm.critic  # pyright: ignore[reportAttributeAccessIssue]
+
+    assert critic(preset("gacrl")) == "central"
+    assert {critic(on_task(preset("gacrl"), name)) for name in ("reference", "scouts", "traffic_junction")} == {
+        "told"
+    }
+    assert critic(from_dict({"env": {"name": "colours"}, "algorithm": {"critic": "sum"}})) == "sum"
+    assert on_task(preset("qmix"), "reference").algorithm == preset("qmix").algorithm
+    assert from_dict({"preset": "gacrl-talk", "env": {"name": "colours"}}) == on_task(preset("gacrl"), "colours")

@@ -63,13 +63,13 @@ def test_what_talks_has_parts_of_its_own(tmp_path: Path):
     """A told critic among them; agents without messages have nobody whom it could teach to talk."""
     talking = configuration.on_task(presets.preset(usual_preset("reference")), "reference")
     assert (talking.preset, usual_preset("spread"), usual_preset(None)) == (
-        "gacrl-talk",
+        "gacrl",
         "gacrl-112k",
         "gacrl-112k",
     )
     known = parts_of(talking)
     assert set(known) - set(PARTS) == {"untold-critic"} and "no-coverage-bonus" not in known
-    assert {"no-heard-slope", "blunt-look", "warm-symbols", "no-logit-price"} < set(known)
+    assert {"no-seen-slope", "no-heard-slope", "blunt-look", "warm-symbols", "no-logit-price"} < set(known)
     runs = {run.name: run.config for run in plan(talking, tmp_path, ["no-messages", "soft-messages"])}
     assert [run.algorithm.critic for run in runs.values()] == ["told", "central", "told"]
 

@@ -72,14 +72,14 @@ def test_the_three_learners_are_about_as_large(tmp_path: Path):
 
 
 def test_only_those_who_talk_are_taught_to(tmp_path: Path):
-    runs = talk.plan(configuration.on_task(configuration.preset("gacrl-talk"), "reference"), tmp_path)
+    runs = talk.plan(configuration.on_task(configuration.preset("gacrl"), "reference"), tmp_path)
     critics = [run.config.algorithm.critic for run in runs]  # pyright: ignore[reportAttributeAccessIssue]
     assert critics == ["central", "told", "central"]
 
 
 def test_the_command_in_the_report_is_the_one_that_was_given():
     """What it says of the task is understood, and trains on the same settings."""
-    usual = configuration.on_task(configuration.preset("gacrl-talk"), "colours")
+    usual = configuration.on_task(configuration.preset("gacrl"), "colours")
     config = configuration.from_dict({"env": {"graph": "full", "named": False, "num_agents": 4}}, usual)
     words = talk._command(config).split()
     assert {"--env.no-named", "--env.graph"} < set(words)

@@ -22,7 +22,7 @@ from gacrl.training.watching import Watcher
 
 pytestmark = pytest.mark.usefixtures("quick_start")
 
-PRESET = configuration.preset("gacrl-talk")
+PRESET = configuration.preset("gacrl")
 CASE = tasks.find("reference").cases["reference"]
 STEPS = (100, 200, 300, 400)
 RETURNS = {"none": -18.0, "told": -8.0, "discrete": -9.0, "tarmac": -30.0}
@@ -130,10 +130,7 @@ def test_scores_run_from_the_best_silent_policy_to_the_best_told_one(
     assert case["kinds"]["dial"]["diverged"] == "seed 0 diverged: loss is nan"
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "0.89 [0.88, 0.90]" in page and "150 (2 of 3)" in page and "diverged" in page
-    assert (
-        "gacrl talk --preset gacrl-talk --seeds 3 --seed 0 --tasks reference --kinds none told discrete dial"
-        in page
-    )
+    assert "gacrl talk --preset gacrl --seeds 3 --seed 0 --tasks reference --kinds none told discrete dial" in page
 
     before = len(trained)
     assert main([*words[:4], "tarmac", "--seeds", "3", "--out", str(out)]) == 0

@@ -66,7 +66,7 @@ def shipped(name: str, **settings: Any) -> play.TrainedRun:
 
 def untrained(task: str, network: dict[str, Any], **settings: Any) -> play.TrainedRun:
     """A policy that has learned nothing is as good a test of what computes it."""
-    config = configuration.on_task(presets.preset("gacrl-talk"), task)
+    config = configuration.on_task(presets.preset("gacrl"), task)
     algorithm = replace(config.algorithm, network=replace(config.algorithm.network, **network))
     config = replace(config, algorithm=algorithm, env=replace(config.env, **settings))
     trainer = build.make_trainer(config, learns=False)

@@ -10,6 +10,7 @@ import pytest
 from jaxtyping import Array
 
 import gacrl
+from gacrl.config import files as configuration
 from gacrl.networks.layers import Linear, Mlp, Score, redrawn
 from gacrl.training.build import make_algorithm
 
@@ -70,10 +71,13 @@ def test_a_network_without_layers_stays() -> None:
     assert redrawn(Bare(jnp.ones(2)), jax.random.key(0)).own.tolist() == [1.0, 1.0]
 
 
-@pytest.mark.parametrize("name", ["gacrl", "gacrl-talk", "mappo", "qmix", "paper"])
-def test_a_learner_begins_with_one_draw(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [("gacrl", "spread"), ("gacrl", "reference"), ("mappo", "spread"), ("qmix", "spread"), ("paper", "spread")],
+)
+def test_a_learner_begins_with_one_draw(name: str, task: str) -> None:
     """A draw is a loop to compile: it does not grow with the layers."""
-    algorithm = make_algorithm(gacrl.preset(name))
+    algorithm = make_algorithm(configuration.on_task(gacrl.preset(name), task))
     made = jax.jit(algorithm.init).lower(jax.random.key(0), algorithm.hyper).as_text()
     assert len(re.findall(r"call @_uniform", made)) == 1
     assert len(re.findall(r"call @_threefry_split|call @_normal|call @_gumbel", made)) == 0

@@ -264,6 +264,25 @@ def test_the_features_of_another_agent_matter():
     np.testing.assert_array_equal(look(HERE, marked, told=False), look(HERE, told=False))
 
 
+def test_who_has_lost_sight_of_landmarks_can_learn_to_see_them_again():
+    """Layers that are quiet for every landmark pass no gradient; with a slope they do."""
+
+    def gradient(seen_slope: float) -> float:
+        network = network_for(FOUR, seen_slope=seen_slope).torso
+        layers = network.landmark.layers
+        quiet = eqx.tree_at(lambda layer: layer.bias, layers[-1], layers[-1].bias - 100.0)
+        network = eqx.tree_at(lambda net: net.landmark.layers, network, (*layers[:-1], quiet))
+
+        def hidden(landmarks: jax.Array) -> jax.Array:
+            state = world(4, 3)._replace(landmarks=landmarks)
+            return jnp.square(network(FOUR.observe(state, FOUR.default_params())).hidden).sum()
+
+        return float(jnp.abs(jax.grad(hidden)(world(4, 3).landmarks)).sum())
+
+    assert gradient(0.0) == 0.0
+    assert gradient(0.1) > 1e-4
+
+
 def test_features_tell_apart_what_stands_at_the_same_place():
     """Two beacons at one place: it matters which features there are, and not which of them has which."""
     twins = [[0.4, 0.2, 1.0, 1.0], [0.4, 0.2, -1.0, 1.0], HERE[2]]

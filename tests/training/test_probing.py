@@ -125,7 +125,7 @@ def test_a_baseline_learns_what_it_can(name: str):
 @pytest.mark.soak
 def test_what_a_teacher_is_told_reaches_the_agents_by_words_alone():
     """As `gacrl doctor` would probe it. Its pupils solve `message` when they talk, and not when they have no words."""
-    asked = trial(presets.preset("gacrl-talk").algorithm)
+    asked = trial(replace(presets.preset("gacrl").algorithm, critic="told"))
     talking = probe_algorithm(*asked, probes=("both", "message"))
     assert talking.returns["both"] == talking.returns["message"] == BEST_RETURN["message"] == 1.0
     mute = replace(asked.algorithm.network, communication="none")

@@ -428,7 +428,7 @@ class Ablate:
     """
 
     preset: str | None = None
-    """The preset that is taken apart, a GACRL one; none: gacrl-112k, and gacrl-talk on tasks that need talk."""
+    """The preset that is taken apart, a GACRL one; none: gacrl-112k, and gacrl on tasks that need talk."""
     part: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """What is taken away; may be given several times. None: everything."""
     seeds: int = 5
@@ -468,7 +468,7 @@ class Talk:
       gacrl talk --tasks reference --kinds discrete tarmac --scale 0.1 --out runs/look
     """
 
-    preset: str = "gacrl-talk"
+    preset: str = "gacrl"
     """The preset that trains all of them."""
     seeds: int = 3
     """Seeds of each."""

@@ -125,6 +125,9 @@ class NetworkConfig:
     """Factor of the second look's attention scores."""
     logit_price: float = 0.0
     """A loss on the mean square of the symbols' logits: who says one word whatever it sees can still change it."""
+    seen_slope: float = 0.0
+    """What the ReLUs over landmarks let pass of negative numbers (graph torso). At 0 they can lose sight of one
+    colour."""
     heard_slope: float = 0.0
     """What the ReLUs of the layers that hear, and of the second look, let pass of negative numbers. At 0 they can fall
     silent before words mean anything, and never hear again (discrete, soft, told)."""
@@ -145,7 +148,7 @@ class NetworkConfig:
         between("algorithm.network", self, 1, 65_536, "signature_size", "value_size")
         between("algorithm.network", self, 1, 65_536, "nearest_landmarks", "nearest_agents")
         between("algorithm.network", self, 1, 100, "depth", "rounds")
-        between("algorithm.network", self, 0.0, 1.0, "heard_slope")
+        between("algorithm.network", self, 0.0, 1.0, "seen_slope", "heard_slope")
         between("algorithm.network", self, 0.0, 100.0, "dial_noise", "symbol_noise", "look_sharpness")
         between("algorithm.network", self, 0.0, 1e6, "radius", "word_price", "logit_price")
         between("algorithm.network", self, 1, 1_000_000_000, "parameters")

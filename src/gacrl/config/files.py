@@ -55,9 +55,9 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
     Raises ConfigError for an unknown key (with the nearest known one), a value of the wrong type, or a task that is
     not at hand.
     """
+    data = converted(data)
     named = presets.preset(_text(data.get("preset", presets.DEFAULT_PRESET), "preset"))
     base = named if base is None else base
-    data = converted(data)
     if isinstance(data.get("algorithm"), Mapping) and "name" in data["algorithm"]:
         settings = dict(data["algorithm"])
         name = _text(settings.pop("name"), "algorithm.name")
@@ -74,17 +74,24 @@ def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConf
 
 
 def on_task(config: RunConfig, name: str) -> RunConfig:
-    """Return the configuration for another task, with that task's settings, and memory where the task needs it.
+    """Return the configuration for another task, with that task's settings.
 
-    As it is where the task is the same. Raises ConfigError for a task that is not at hand.
+    With memory where the task needs it, and with a critic that is told where the task needs talk. As it is where the
+    task is the same. Raises ConfigError for a task that is not at hand.
     """
     if name == config.task:
         return config
-    on = replace(config, task=name, env=tasks.default_settings(name))
+    task, on = tasks.find(name), replace(config, task=name, env=tasks.default_settings(name))
     network = getattr(config.algorithm, "network", None)
-    if network is None or not tasks.find(name).needs_memory:
-        return on
-    return replace(on, algorithm=replace(config.algorithm, network=replace(network, recurrent=True)))
+    if network is not None and task.needs_memory:
+        on = replace(on, algorithm=replace(on.algorithm, network=replace(network, recurrent=True)))
+    return with_told_critic(on) if task.needs_talk else on
+
+
+def with_told_critic(config: RunConfig) -> RunConfig:
+    """Return the settings with a critic that is told what others see, where it is a central one."""
+    central = getattr(config.algorithm, "critic", None) == "central"
+    return replace(config, algorithm=replace(config.algorithm, critic="told")) if central else config
 
 
 def changed(settings: Any, changes: Mapping[str, Any]) -> Any:

@@ -8,6 +8,8 @@ from gacrl.errors import ConfigError
 
 _RENAMED = {"epsilon_steps": "exploration_steps", "yoked_coverage": "yoked_progress"}
 """Of the algorithm, since version 0.1.0."""
+_PRESETS = {"gacrl-talk": "gacrl"}
+"""`gacrl` with a told critic, which it has by itself now where a task needs talk."""
 _RADIUS = "0.2"
 """Of the coverage that 0.1.0's exploration followed unless it was told otherwise; it is spread's progress now."""
 
@@ -15,7 +17,9 @@ _RADIUS = "0.2"
 def converted(data: Mapping[str, Any]) -> dict[str, Any]:
     """Plain settings in today's names. Raises ConfigError for what no version since 0.1.0 does as it did."""
     found = {name: dict(part) if isinstance(part, Mapping) else part for name, part in data.items()}
-    algorithm = found.get("algorithm")
+    preset, algorithm = found.get("preset"), found.get("algorithm")
+    if isinstance(preset, str) and preset in _PRESETS:
+        found["preset"] = _PRESETS[preset]
     if isinstance(algorithm, dict):
         _convert_algorithm(algorithm)
     _move_settings_of_tasks(found)

@@ -113,7 +113,7 @@ def ablate(
             raise UserError(unknown("part", name, list(known)))
     steps = config.training.env_steps if env_steps is None else whole(env_steps, "env_steps")
     configured = config.algorithm.updates
-    usual = configured if tasks.find(config.task).cases else max(configured // 2, 1)
+    usual = configured if tasks.find(config.task).needs_talk else max(configured // 2, 1)
     updates = usual if updates is None else whole(updates, "updates")
     config = replace(
         config,

@@ -10,7 +10,7 @@ from gacrl.config.run import RunConfig
 from gacrl.tasks.task import Part
 
 NO_MESSAGES, YOKED = "no-messages", "yoked-exploration"
-PRESET, TALKING_PRESET = "gacrl-112k", "gacrl-talk"
+PRESET, TALKING_PRESET = "gacrl-112k", "gacrl"
 """What is taken apart where nobody says: on most tasks, and on those that need talk."""
 
 
@@ -38,6 +38,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         ),
         "no-second-look": Part("nothing is looked at after the messages", _network(second_look=False)),
         "blunt-look": Part("the second look's attention as wide as usual", _network(look_sharpness=1.0)),
+        "no-seen-slope": Part("ReLUs over landmarks, which can lose sight of some", _network(seen_slope=0.0)),
         "no-heard-slope": Part("ReLUs that hear, which can fall silent", _network(heard_slope=0.0)),
         "no-logit-price": Part("large logits of symbols cost nothing", _network(logit_price=0.0)),
         "warm-symbols": Part("τ stays at 1", _algorithm(temperature=1.0, temperature_end=1.0)),
@@ -67,4 +68,4 @@ def parts_of(config: RunConfig) -> dict[str, Part]:
 
 def usual_preset(task: str | None) -> str:
     """Return the preset that is taken apart on a task where nobody says which; None: no task is named."""
-    return TALKING_PRESET if task is not None and tasks.find(task).cases else PRESET
+    return TALKING_PRESET if task is not None and tasks.find(task).needs_talk else PRESET

@@ -12,7 +12,15 @@ from gacrl.training.devices import one_seed
 
 SETTINGS = (
     *("communication", "rounds", "vocabulary", "speaker_identity", "latent", "latent_size"),
-    *("second_look", "look_sharpness", "heard_slope", "radius", "nearest_landmarks", "nearest_agents"),
+    *(
+        "second_look",
+        "look_sharpness",
+        "seen_slope",
+        "heard_slope",
+        "radius",
+        "nearest_landmarks",
+        "nearest_agents",
+    ),
 )
 """What of `NetworkConfig` decides how the page's network acts."""
 

@@ -82,7 +82,7 @@ class GraphTorso(eqx.Module):
         own = seen.own.shape[-1]
         known, told = (0 if it is None else it.shape[-1] for it in (seen.landmark_features, seen.agent_features))
         self.rival = Mlp(2 * SCALES + known + told, (narrow,), rival_key, gain)
-        self.landmark = Mlp(own + SCALES + known + narrow, (width, width), landmark_key, gain)
+        self.landmark = Mlp(own + SCALES + known + narrow, (width, width), landmark_key, gain, config.seen_slope)
         self.agent = Mlp(own + SCALES + told, (narrow,), agent_key, gain)
         self.attention = Score(width, attention_key, gain)
         self.out = Mlp(own + 2 * width + narrow, (width,), out_key, gain)
@@ -200,5 +200,5 @@ def _repeat(own: Float[Array, "N K"], entities: Float[Array, "N M 2"]) -> Float[
 
 
 def _pool_max(values: Float[Array, "..."], there: Bool[Array, "..."], axis: int) -> Float[Array, "..."]:
-    """The largest over an axis, of those that are there; they are ReLU outputs, so that nobody there is 0."""
+    """The largest over an axis of those that are there, and at least 0, which stands for nobody there."""
     return jnp.max(jnp.where(there[..., None], values, 0.0), axis=axis, initial=0.0)

@@ -137,6 +137,8 @@ class Task(NamedTuple):
     from. The scores are those of a task with these settings."""
     needs_memory: bool = False
     """What was seen or heard at earlier steps must be remembered."""
+    needs_talk: bool = False
+    """What an agent should do hangs on what others alone see: GACRL's critic is told it (`files.on_task`)."""
     scene: Callable[[Settings, EnvState, EnvParams], Any] | None = None
     """What a picture of a state shows (`gacrl.scene`). None: discs, where positions are known."""
     edit: Callable[[EnvState, Any], EnvState] | None = None

@@ -11,6 +11,7 @@ from gacrl.cli.main import main
 from gacrl.experiments.paper import grid as sweep
 from gacrl.experiments.paper.grid import Grid, Member, Point, expected_range, noise_of, paper_grid
 from gacrl.training import build
+from gacrl.versions import versions
 
 pytestmark = [pytest.mark.usefixtures("quick_start"), pytest.mark.xdist_group("runs")]
 
@@ -79,18 +80,22 @@ def test_it_goes_on_with_what_is_missing_and_its_numbers_are_those_of_single_run
             b'\xff\xfe\n{"learning_rate": 0.1, "epsilon": 0.3, "temperature": 2.5, "seed": 1, "reward_shaped": NaN}\n'
         )
         file.write(
-            b'{"learning_rate": 0.1, "epsilon": 0.3, "temperature": 2.0, "seed": 1, "reward_shaped": null}\n'
+            b'{"learning_rate": 0.1, "epsilon": 0.3, "temperature": 2.0, "seed": 1, "reward_shaped": null, '
+            b'"versions": {"git_commit": "abc"}}\n'
         )
     said.clear()
     third = sweep.sweep(grid, tmp_path / "out", said.append, together=2)
     assert third.winner != Point(0.1, 0.3, 2.0)
-    assert json.loads((tmp_path / "out/summary.json").read_text())["means"][2]["mean"] is None
+    kept = json.loads((tmp_path / "out/summary.json").read_text())
+    assert kept["means"][2]["mean"] is None
+    assert [row["reward_shaped"] for row in kept["scores"]].count(None) == 1
+    assert [made.get("git_commit") for made in kept["versions"]] == [versions().get("git_commit"), "abc"]
     assert not any(line.startswith("group") for line in said)
 
     page = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
     assert "4 settings of GACRL as printed, 2 seeds each" in page and "diverged" in page
     assert "| 0.1 | 0.3 | 2.5 |" in page
-    assert "would spread over" in page
+    assert "would spread over" in page and "not of one version of the code" in page
     assert (tmp_path / "out" / "report-figures" / "surface.svg").is_file()
 
 

@@ -23,6 +23,7 @@ from gacrl.config.run import RunConfig
 from gacrl.errors import UserError
 from gacrl.evaluation.evaluate import stream_key
 from gacrl.evaluation.statistics import difference, estimate
+from gacrl.experiments.provenance import Versions, commits, doubts
 from gacrl.experiments.study import claim_folder
 from gacrl.report import figures
 from gacrl.report.page import Page
@@ -32,6 +33,7 @@ from gacrl.training.devices import shard_seeds, stack_seeds
 from gacrl.training.divergence import not_finite
 from gacrl.training.recorder import RunFolder
 from gacrl.training.trainer import AbstractTrainer
+from gacrl.versions import versions
 
 SCORE = "reward_shaped"
 _RESULTS, _MARKER = "results.jsonl", "sweep.json"
@@ -106,6 +108,9 @@ class Sweep:
     noise: Noise
     confirmed: Mapping[Point, tuple[float, ...]]
     """The scores on fresh seeds, of the winner and the paper's choice."""
+    scores: Mapping[Member, float]
+    """Of every training."""
+    made_by: Sequence[Versions]
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -115,6 +120,8 @@ class Sweep:
             "means": [{**point._asdict(), "mean": _number(mean)} for point, mean in self.means.items()],
             "noise": asdict(self.noise),
             "confirmed": [{**point._asdict(), "values": values} for point, values in self.confirmed.items()],
+            "scores": [_row(member, score) for member, score in self.scores.items()],
+            "versions": self.made_by,
         }
 
 
@@ -173,8 +180,9 @@ def _sweep(grid: Grid, out: Path, say: Callable[[str], None], together: int | No
     finite = table[np.isfinite(table).all(1)]
     if len(finite) < 2:
         raise UserError(f"all settings but {len(finite)} diverged: there is nothing to compare")
-    done = Sweep(out, out / "report.html", winner, means, noise_of(finite), confirmed)
-    _report(grid, scores, done)
+    made = _made_by(out)
+    done = Sweep(out, out / "report.html", winner, means, noise_of(finite), confirmed, scores, made)
+    _report(grid, done)
     return done
 
 
@@ -295,8 +303,25 @@ def _read(out: Path) -> Scores:
     return scores
 
 
+def _made_by(out: Path) -> list[Versions]:
+    """The versions that trained what is in the folder, each once; older lines do not say theirs."""
+    found: list[Versions] = []
+    for line in (out / _RESULTS).read_bytes().splitlines():
+        try:
+            made = json.loads(line).get("versions")
+        except (ValueError, AttributeError, RecursionError):
+            continue
+        if made and made not in found:
+            found.append(made)
+    return found
+
+
+def _row(member: Member, score: float) -> dict[str, Any]:
+    return {**member.point._asdict(), "seed": member.seed, SCORE: _number(score)}
+
+
 def _append(out: Path, found: Scores) -> None:
-    rows = [{**point._asdict(), "seed": seed, SCORE: _number(score)} for (point, seed), score in found.items()]
+    rows = [{**_row(member, score), "versions": versions()} for member, score in found.items()]
     with (out / _RESULTS).open("ab+") as file:
         file.seek(0)
         before = file.read()
@@ -309,8 +334,10 @@ def _number(score: float) -> float | None:
     return score if math.isfinite(score) else None
 
 
-def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
+def _report(grid: Grid, done: Sweep) -> None:
     page = Page("The paper's grid search")
+    for sentence in doubts(done.made_by):
+        page.text(sentence)
     page.text(
         f"{len(grid.points)} settings of GACRL as printed, {len(grid.seeds)} seeds each, by shaped reward, the mean "
         f"over the first {grid.episodes} episodes of training."
@@ -337,7 +364,7 @@ def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
         [
             *(f"{number:g}" for number in point),
             _told(done.means[point]),
-            ", ".join(_told(scores[Member(point, seed)]) for seed in grid.seeds),
+            ", ".join(_told(done.scores[Member(point, seed)]) for seed in grid.seeds),
             ", ".join(name for name, it in (("winner", done.winner), ("the paper's", grid.choice)) if it == point),
         ]
         for point in grid.points
@@ -345,6 +372,7 @@ def _report(grid: Grid, scores: Scores, done: Sweep) -> None:
     page.table(("learning rate", "ε₀", "τ₀", "mean", "seeds", ""), rows)
     page.heading("How this was made")
     page.code(f"gacrl sweep paper-grid --seeds {len(grid.seeds)} --episodes {grid.episodes}")
+    page.text(f"Code of commit {', '.join(commits(done.made_by))}.")
     page.write(done.out, "report")
     (done.out / "summary.json").write_text(json.dumps(done.to_dict(), indent=2) + "\n", encoding="utf-8")
 

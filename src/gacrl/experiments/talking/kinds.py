@@ -27,6 +27,8 @@ NONE, REMEMBERING, TOLD, SYMBOLS, UTTERED = "none", "none-recurrent", "told", "d
 SILENT = (NONE, REMEMBERING)
 """Who says nothing: the better one is the floor of a score."""
 EVALUATIONS = 16
+CLOSING_EPISODES = 512
+"""Whatever is compared at the end plays as many."""
 _WINDOW = 8
 """Steps of a replayed window where something is carried from step to step, as the preset `dial` has it."""
 
@@ -63,7 +65,7 @@ def base(config: RunConfig, case: Case, seeds: int, scale: float) -> Base:
 
 
 def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunConfig:
-    """Return the settings of the learner with symbols. Raises UserError for what cannot talk."""
+    """Return the settings of the learner with symbols, whose critic is told. Raises UserError for what cannot talk."""
     if getattr(config.algorithm, "network", None) is None:
         raise UserError(
             f"--preset {config.preset} has a network of its own: name one whose messages can be chosen"
@@ -76,7 +78,7 @@ def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunC
         "training": {"env_steps": env_steps},
         "evaluation": {"interval": max(interval, 1)},
     }
-    return configuration.from_dict(changes, config)
+    return configuration.with_told_critic(configuration.from_dict(changes, config))
 
 
 def num_parameters(config: RunConfig) -> int:

@@ -23,8 +23,8 @@ from gacrl.experiments.talking.trials import FACTORS, tried, tuned
 from gacrl.tasks.task import Case
 from gacrl.training.recorder import RunFolder
 
-EPISODES, CLOSING_EPISODES = 320, 512
-"""Of the evaluations along the way, and of the closing one."""
+EPISODES = 320
+"""Of the evaluations along the way."""
 
 
 class Cell(NamedTuple):
@@ -135,7 +135,7 @@ def _as_it_was(run: Planned) -> Planned:
 
 def plan(config: RunConfig, out: Path, seeds: int, scale: float) -> list[Cell]:
     """Plan every cell that there can be. Raises UserError for a preset whose agents cannot talk."""
-    evaluation = replace(config.evaluation, num_episodes=EPISODES, final_episodes=CLOSING_EPISODES)
+    evaluation = replace(config.evaluation, num_episodes=EPISODES, final_episodes=talkers.CLOSING_EPISODES)
     config = replace(config, evaluation=evaluation)
     cells: list[Cell] = []
     for name, (task, case) in all_cases().items():

@@ -101,7 +101,7 @@ export class Policy {
       if (other.features.length > 0) addProduct(rival, other.features, pair, 2 * SCALES + landmark.features.length);
       raise(contest, rectify(pair));
     }
-    return mlp(this.torso.landmark, concat(own, scales(x, y), landmark.features, contest));
+    return mlp(this.torso.landmark, concat(own, scales(x, y), landmark.features, contest), this.settings.seen_slope);
   }
 
   // Whom an agent hears: its nearest ones, where the network listens to so many.

@@ -45,6 +45,7 @@ REFERENCE = Task(
     uttered=uttered,
     words=Words(mark="landmark", lit="reached"),
     actions=actions,
+    needs_talk=True,
     cases={"reference": Case(40_000, _ON_GOAL, utterances=_UTTERED)},
     summary="each of two agents knows the other's goal alone (MPE2 simple_reference_v3)",
 )

@@ -103,6 +103,7 @@ SCOUTS = TASK._replace(
     anchors=Path(__file__).with_name("anchors") / "scouts.json",
     scene=scouts.scene,
     comparable=(*COMPARABLE, "num_blind"),
+    needs_talk=True,
     cases={"scouts": Case(75_000, "coverage_final_0.1", moves_tell=True)},
     summary="spread where one agent sees no landmarks: the others must tell it where to go",
 )

@@ -41,6 +41,7 @@ TASK = Task(
     anchors=Path(__file__).with_name("anchors.json"),
     # Where all cars are and where they go says all that can be known of the next step.
     needs_memory=False,
+    needs_talk=True,
     scene=scene,
     comparable=COMPARABLE,
     ragged=ragged,
