@@ -42,9 +42,8 @@ def view(words: Words) -> int:
         running.warm_up(cast)
         board = Board()
         server = running.Running(cast, listener, asked.host, running.new_token(), board)
-        running.beside(
-            lambda: running.warm_up_the_rest(cast, server.server.busy), lambda: lore.keep_telling(cast, board)
-        )
+        busy = server.server.busy
+        running.beside(lambda: running.warm_up_the_rest(cast, busy), lambda: lore.keep_telling(cast, board))
         running.beside(lambda: following.follow(cast, board))
         print(f"page       {server.address}", flush=True)
         print("           Ctrl-C ends it; the address is a key: give it to nobody else", flush=True)
