@@ -7,12 +7,11 @@ Of docs/pages/gacrl-teams.html, playing, alone and beside the untouched run: the
 """
 
 import os
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import sync_playwright
+import chromium
 
 PAGE = Path(__file__).parent.parent / "docs" / "pages" / "gacrl-teams.html"
 FRAMES = 240
@@ -28,10 +27,8 @@ WATCH = """count => new Promise(done => {
 
 def main() -> None:
     """Print a line for each number of agents, alone and beside the untouched run."""
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}; milliseconds of {FRAMES} frames")
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+    with chromium.opened() as opened:
         print(f"Chromium {opened.version}")
         for agents in sys.argv[1:] or ("5", "30", "100"):
             page = opened.new_page(viewport={"width": 1200, "height": 900})
@@ -41,7 +38,6 @@ def main() -> None:
             page.evaluate("gacrlPage.act.silence(true)")
             print(f"{agents:>4} agents, both pictures   {frames(page)}")
             page.close()
-        opened.close()
 
 
 def frames(page: Any) -> str:

@@ -19,7 +19,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import statistics
 import subprocess
@@ -31,6 +30,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import chromium
 from websockets.sync.client import connect
 
 CROWD = 100
@@ -145,23 +145,15 @@ def pace(line: Line, process: int, seed: int, *events: dict[str, Any]) -> tuple[
 
 def first_paint(address: str) -> float | None:
     """Seconds from opening the address in Chromium until the page shows its first frame; None without a browser."""
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
+    if chromium.missing():
         return None
-    if chromium is None:
-        return None
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+    with chromium.opened() as browser:
         tab = browser.new_page()
         begun = time.perf_counter()
         tab.goto(address)
         while not tab.evaluate("globalThis.gacrlPage !== undefined"):
             time.sleep(0.01)
-        seconds = time.perf_counter() - begun
-        browser.close()
-    return seconds
+        return time.perf_counter() - begun
 
 
 def train(env_steps: int, interval: int, num_seeds: int) -> dict[str, Any]:

@@ -160,12 +160,13 @@ def from_outside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     """A headless Chromium. Where there is none, its tests are skipped with a line that says so; `.ci/run` has one."""
-    missing = browsing.missing()
+    missing = browsing.chromium.missing()
     if missing and "GACRL_BROWSER" in os.environ:
         pytest.fail(missing)
     if missing:
         pytest.skip(missing)
-    yield from browsing.opened()
+    with browsing.chromium.opened() as found:
+        yield found
 
 
 def soaked(cases: Iterable[Any], *kept: Any) -> list[Any]:

@@ -1,11 +1,11 @@
 """The live page in a real browser: it plays, listens to hands, and stays on the page when the server is lost."""
 
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from browsing import Visit
 from serving import Site, cast_of, serving
 
 
@@ -21,29 +21,8 @@ def teams() -> Iterator[Site]:
         yield site
 
 
-class Visit:
-    """A page in the browser; its errors are kept, and whom it asks for what."""
-
-    def __init__(self, browser: Any, site: Site, fragment: str = "", width: int = 1200, scheme: str = "light"):
-        self.page = browser.new_page(
-            viewport={"width": width, "height": 900}, reduced_motion="reduce", color_scheme=scheme
-        )
-        self.wrong: list[str] = []
-        self.asked: list[str] = []
-        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on(
-            "console", lambda said: self.wrong.append(said.text) if said.type in ("error", "warning") else None
-        )
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(site.url + fragment)
-        self.until("globalThis.gacrlPage !== undefined")
-
-    def until(self, expression: str) -> None:
-        """Wait for it. (Playwright's own waiting evaluates text, which the page's policy forbids.)"""
-        deadline = time.monotonic() + 60
-        while not self.page.evaluate(expression):
-            assert time.monotonic() < deadline, expression
-            time.sleep(0.05)
+class LiveVisit(Visit):
+    """A page whose frames come from a server."""
 
     def at(self, step: int) -> Any:
         """Go to a step and return what is shown there, once the server has played it."""
@@ -60,10 +39,6 @@ class Visit:
             step,
         )
 
-    def close(self) -> None:
-        assert self.wrong == [] and len(self.asked) == 1, "one page is loaded, and nothing else"
-        self.page.close()
-
 
 def away(moment: dict[str, Any]) -> float:
     """How far the nearest agent is from landmark 0."""
@@ -71,7 +46,7 @@ def away(moment: dict[str, Any]) -> float:
 
 
 def test_it_plays_and_a_silenced_agent_costs_the_other_its_goal(reference: Site, browser: Any):
-    visit = Visit(browser, reference)
+    visit = LiveVisit(browser, reference.url)
     page = visit.page
     page.keyboard.press(" ")
     visit.until("gacrlPage.still.t > 3")
@@ -92,8 +67,35 @@ def test_it_plays_and_a_silenced_agent_costs_the_other_its_goal(reference: Site,
     visit.close()
 
 
+def test_it_says_what_an_agent_sees_and_says_and_what_is_found_out_later(reference: Site, browser: Any):
+    visit = LiveVisit(browser, reference.url, "#seed=3&n=2&at=9")
+    said = visit.at(9) and visit("gacrlPage.session.main.frames[9].decision.said.map(round => round[1])")
+    visit.press("a", "a")
+    visit.until("document.getElementById('about-name').textContent === 'Agent 1'")
+    about = visit.page.locator("#about").inner_text()
+    for part in ("Sees", "Must reach", "agent 0 (100\u00a0% of its attention)", "Then looks at", "looks worth"):
+        assert part in about
+    assert f"{chr(65 + said[0])} (" in about and "Means" not in about
+    assert visit.page.locator("#gauges tbody tr").count() == 1 and visit.page.locator("#dictionary").is_hidden()
+    word = {"agent": 1, "round": 0, "symbol": said[0], "of": "heard", "share": 0.5, "goal": [2, 0.75]}
+    word |= {"direction": [2, 0.5], "distance": 0.25, "action": [1, 0.4]}
+    reference.board.put("words", dictionary=[word], heard=1000)
+    reference.board.put(
+        "known", yardsticks={"told": {"return": [-1.0 * t for t in range(25)], "share": [0.5] * 25}}
+    )
+    visit.until("document.getElementById('about').textContent.includes('Means')")
+    assert (
+        "go to purple square (75\u00a0%). That lies above (50\u00a0%), 0.25 away"
+        in visit.page.locator("#about").inner_text()
+    )
+    assert "in 1,000 recorded episodes" in visit.page.locator("#heading").inner_text()
+    assert visit.page.locator("#gauges tbody").inner_text().split()[-4:] == ["told", "-8.0", "50", "%"]
+    reference.board.notes.clear()
+    visit.close()
+
+
 def test_dragged_landmarks_are_followed_and_thirty_agents_fit(teams: Site, browser: Any):
-    visit = Visit(browser, teams, "#seed=1&n=5&at=0")
+    visit = LiveVisit(browser, teams.url, "#seed=1&n=5&at=0")
     page = visit.page
     before = visit.at(20)["main"]
     box = page.locator("#scene").bounding_box()
@@ -117,7 +119,7 @@ def test_dragged_landmarks_are_followed_and_thirty_agents_fit(teams: Site, brows
 
 def test_the_page_outlives_its_server(browser: Any):
     with serving(cast_of("pretrained:gacrl-reference")) as site:
-        visit = Visit(browser, site)
+        visit = LiveVisit(browser, site.url)
         assert visit.page.locator("#notice").is_hidden()
         visit.at(5)
     visit.until("!document.getElementById('notice').hidden")
@@ -131,7 +133,7 @@ def test_the_page_outlives_its_server(browser: Any):
 def test_it_is_readable_on_a_phone(reference: Site, browser: Any, scheme: str):
     curves = {"label": "return", "steps": [10, 20, 30], "seeds": [[-30.0, -22.0, -20.5], [-29.0, -26.0, -21.0]]}
     reference.board.put("learning", **curves, playing=30)
-    visit = Visit(browser, reference, "#seed=1&n=2&at=8&do=0:voice:0:silence", width=390, scheme=scheme)
+    visit = LiveVisit(browser, reference.url, "#seed=1&n=2&at=8&do=0:voice:0:silence", width=390, scheme=scheme)
     visit.at(8)
     visit.until("document.getElementById('learning') !== null")
     assert visit.page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -18,11 +18,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from gacrl import play
+from gacrl.export import html
+from gacrl.export.source import Source
 from gacrl.training.build import Plan
+from gacrl.viewer import lore
 from gacrl.viewer.beside import page_beside
 from gacrl.viewer.following import learning
 from gacrl.viewer.guard import Guard
-from gacrl.viewer.server import MOST_VISITORS
+from gacrl.viewer.server import MOST_VISITORS, Board
 
 SILENCE = {"at": 0, "kind": "fate", "agent": 0, "fate": {"kind": "silence"}}
 
@@ -210,6 +213,26 @@ def test_what_is_put_up_reaches_who_comes_later(reference: Site):
     with reference.visit() as visitor:
         assert visitor.hear() == {"kind": "learning", **curves, "playing": 20}
     reference.board.notes.clear()
+
+
+@pytest.mark.soak
+def test_what_is_counted_later_is_what_the_exported_page_has(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    board, out = Board(), tmp_path / "page.html"
+
+    def ends(seconds: float) -> None:
+        raise StopIteration
+
+    monkeypatch.setattr("gacrl.viewer.lore.time.sleep", ends)
+    with pytest.raises(StopIteration):
+        lore.keep_telling(cast_of("pretrained:gacrl-reference"), board)
+    html.write(Source("pretrained:gacrl-reference"), out)
+    data = re.search(r'id="data">(.*?)</script>', out.read_text(encoding="utf-8"), re.DOTALL)
+    assert data is not None
+    exported = json.loads(data[1])
+    assert exported["heard"] == 1000 and len(exported["dictionary"]) > 10
+    for note in ("known", "words"):
+        told = json.loads(board.notes[note])
+        assert told == {"kind": note, **{name: exported[name] for name in told if name != "kind"}}
 
 
 @pytest.mark.soak

@@ -101,7 +101,7 @@ def test_agents_come_and_go_and_a_radius_silences():
     """A team that grows in the middle of an episode goes on from where it stood, and plays as one that began so large."""
     cast = cast_of("pretrained:gacrl-teams")
     player, show = cast.players[0], Show(cast)
-    assert cast.bounds[:2] == (1, 100) and player.sizes == (5, 8, 32, 100)
+    assert cast.bounds[:2] == (1, 100) and player.sizes == (5, 32, 100)
     show.take(Scene(1, 5, (Event(4, "add"), Event(4, "add"), Event(6, "remove"))))
     before, after, fewer = (show.frame(t)["main"] for t in (3, 4, 6))
     assert (before["count"], after["count"], fewer["count"]) == (5, 7, 6)
@@ -175,3 +175,46 @@ def test_any_task_can_be_watched():
     pair = rivals.frame(25)
     assert rivals.frame(0)["main"]["agents"] == rivals.frame(0)["twin"]["agents"]
     assert pair["main"]["earned"] > pair["twin"]["earned"] + 1
+
+
+def test_what_is_told_of_a_decision_is_how_it_came_about(quick_start: None):
+    """The word that is said is the likeliest, the action that is taken looks best; attention is what listeners have."""
+    show = Show(cast_of("pretrained:gacrl-reference"))
+    show.take(Scene(5, 2, (Event(0, "move", thing="mark", which=2, place=(0.5, -0.25)),)))
+    moments = [show.frame(t)["main"] for t in range(25)]
+    for moment in moments:
+        assert [[words[0] for words in said] for said in moment["words"]] == moment["said"]
+        assert all(0 < words[1] <= 100 and words[1] >= words[3] for said in moment["words"] for words in said)
+        assert [int(np.argmax(values)) for values in moment["values"]] == moment["actions"]
+        assert moment["heeded"] == [[100], [100]], "whoever hears one agent alone heeds it alone"
+        places = np.array([moment["marks"]["x"], moment["marks"]["y"]]).T
+        for agent, (marks, others, more) in enumerate(moment["sees"]):
+            here = np.array([moment["agents"]["x"][agent], moment["agents"]["y"][agent]])
+            assert marks == np.argsort(np.hypot(*(places - here).T)).tolist() and (others, more) == ([], 0)
+    goals = [moments[0]["marks"]["colour"].index(colour) for colour in moments[0]["agents"]["colour"]]
+    assert [looks[0] for looks in moments[12]["looks"]] == goals, "they look at what they were told"
+    show.take(Scene(5, 2, fated({0: Fate("silence")})))
+    assert show.frame(3)["main"]["heeded"] == [[100], []]
+
+
+def test_attention_in_a_crowd_is_shared_among_whom_one_hears(quick_start: None):
+    show = Show(cast_of("pretrained:gacrl-teams"))
+    show.take(Scene(1, 20, (Event(0, "radius", value=10.0),)))
+    moment = show.frame(2)["main"]
+    assert set(map(len, moment["hears"])) == {12}, "its nearest ones"
+    for heard, shares in zip(moment["hears"], moment["heeded"], strict=True):
+        assert len(heard) == len(shares) and abs(sum(shares) - 100) <= 7
+    for marks, others, more in moment["sees"]:
+        assert len(marks) == len(others) == 4 and more == 20 + 19 - 8
+
+
+def test_a_jump_is_played_in_slices(quick_start: None):
+    show = Show(cast_of("pretrained:gacrl-reference"))
+    show.take(Scene(8, 2, fated({0: Fate("scramble")})))
+    slices = 0
+    while not show.toward(20, 0.0):
+        slices += 1
+    assert slices > 40, "a step at a time: of the run elsewhere, of this one and of the untouched one"
+    whole = Show(cast_of("pretrained:gacrl-reference"))
+    whole.take(Scene(8, 2, fated({0: Fate("scramble")})))
+    assert whole.frame(20) == show.frame(20)

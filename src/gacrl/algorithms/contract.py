@@ -31,6 +31,8 @@ class Algorithm(NamedTuple):
     """The same learner without what only learning needs, () in its place: `policy` takes it as well."""
     network: Callable[[Learner], AgentNetwork] | None = None
     """The network of the greedy policy, where that takes the largest available number of its head and no more."""
+    draws: bool = False
+    """The head of that network has logits, by which actions are drawn while learning; otherwise it has values."""
     parameters: Callable[[Learner], Any] = lambda learner: learner
     """The numbers that are learned."""
     learned: Callable[[Learner], Learner] = lambda learner: learner

@@ -156,6 +156,7 @@ def make(
         ),
         acting=lambda learner: learner._replace(optimizer=()),
         network=None if config.symmetric_play or env.continuous_actions else lambda learner: learner.network.actor,
+        draws=True,
         parameters=lambda learner: learner.network,
         learned=lambda learner: learner._replace(optimizer=(), updates=(), hyper=(), exploration=()),
         splits_envs=True,

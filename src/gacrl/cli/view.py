@@ -28,7 +28,7 @@ def view(words: Words) -> int:
     from gacrl.training.devices import prepare_jax
 
     prepare_jax()
-    from gacrl.viewer import following, running
+    from gacrl.viewer import following, lore, running
     from gacrl.viewer.cast import open_cast
     from gacrl.viewer.server import Board
 
@@ -42,7 +42,8 @@ def view(words: Words) -> int:
         running.warm_up(cast)
         board = Board()
         server = running.Running(cast, listener, asked.host, running.new_token(), board)
-        running.beside(lambda: running.warm_up_the_rest(cast, server.server.shown))
+        busy = server.server.busy
+        running.beside(lambda: running.warm_up_the_rest(cast, busy), lambda: lore.keep_telling(cast, board))
         running.beside(lambda: following.follow(cast, board))
         print(f"page       {server.address}", flush=True)
         print("           Ctrl-C ends it; the address is a key: give it to nobody else", flush=True)

@@ -62,6 +62,7 @@ def common(task: Task, settings: Any, name: str) -> dict[str, Any]:
         "measures": {},
         "yardsticks": {},
         "dictionary": [],
+        "heard": 0,
         "world": None,
         "network": None,
         "replays": None,
@@ -76,18 +77,28 @@ def _live(opened: TrainedRun) -> dict[str, Any] | None:
     if known is None or network is None:
         return None
     rules: dict[str, Any] = {**known}
-    apart = "most_agents" not in rules
-    if not apart and network["settings"]["nearest_agents"] is None:
+    if "most_agents" in rules and network["settings"]["nearest_agents"] is None:
         rules["most_agents"] = max(UNBOUNDED, env.num_agents)
-    talks = network["settings"]["communication"] != "none"
-    heard = _episodes(opened, HEARD) if talks else []
     return {
         "world": rules,
         "network": network,
         "measures": rules["measures"],
         "yardsticks": yardsticks(task, env, params, rules["measures"]),
-        "dictionary": dictionary(heard, network["settings"]["vocabulary"], apart) if heard else [],
+        **heard(opened, HEARD),
     }
+
+
+def heard(opened: TrainedRun, count: int, sampled: bool = False) -> dict[str, Any]:
+    """Count what the words of a policy go with in so many recorded episodes: {dictionary, heard: episodes}.
+
+    Agents that come and go have their words in common; elsewhere each has its own.
+    """
+    network = getattr(opened.config.algorithm, "network", None)
+    if network is None or not kind_of(network).sends_symbols:
+        return {}
+    episodes = _episodes(opened, count, sampled=sampled)
+    apart = opened.task.world is not None and opened.task.team is None
+    return {"dictionary": dictionary(episodes, network.vocabulary, apart), "heard": count}
 
 
 def _recorded(opened: TrainedRun) -> dict[str, Any]:
@@ -98,14 +109,13 @@ def _recorded(opened: TrainedRun) -> dict[str, Any]:
             f"{opened.task.name} does not say where things are: give its observations positions, or a scene"
         )
     config = getattr(opened.config.algorithm, "network", None)
-    silenced, words = [], []
+    silenced = []
     if played[0].messages is not None and config is not None:
         silenced = _episodes(opened, REPLAYED, interventions.silence())
-        words = dictionary(played, config.vocabulary, False) if kind_of(config).sends_symbols else []
     kept = _fitting(played, silenced)
     return {
         "replays": {"played": replays.replay(played[:kept]), "silenced": replays.replay(silenced[:kept])},
-        "dictionary": words,
+        **heard(opened, HEARD),
     }
 
 
@@ -115,9 +125,11 @@ def _fitting(*groups: list[Episode]) -> int:
     return int(np.clip(MOST_BYTES // 2 // size, 1, REPLAYED))
 
 
-def _episodes(opened: TrainedRun, count: int, intervention: Intervention | None = None) -> list[Episode]:
-    """Record greedy play from the starts of the closing evaluation."""
+def _episodes(
+    opened: TrainedRun, count: int, intervention: Intervention | None = None, sampled: bool = False
+) -> list[Episode]:
+    """Record play from the starts of the closing evaluation, greedy unless it is `sampled`."""
     happens = opened.trainer.intervention if intervention is None else intervention
-    play = partial(record_many, opened.env, opened.policy(0, False), opened.trainer.memory)
+    play = partial(record_many, opened.env, opened.policy(0, sampled), opened.trainer.memory)
     look = look_of(opened.task, opened.config.env)
     return play(opened.trainer.evaluation_params, stream_key("report"), count, happens, look)

@@ -43,6 +43,7 @@ def network(opened: TrainedRun) -> dict[str, Any] | None:
         return None
     found = find(one_seed(opened.learners, 0))
     settings = {name: getattr(config, name) for name in SETTINGS} | {"num_agents": opened.env.num_agents}
+    settings |= {"draws": opened.trainer.algorithm.draws}
     return {"settings": settings, **_weights(found)}
 
 

@@ -17,7 +17,7 @@ from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks import communication
 from gacrl.networks import torso as torsos
-from gacrl.networks.communication.base import Communication, Neighbourhood
+from gacrl.networks.communication.base import Communication, Neighbourhood, Weighed
 from gacrl.networks.encoder import Code
 from gacrl.networks.graph import heard_adjacency, nearest_speakers
 from gacrl.networks.gru import Gru
@@ -46,6 +46,10 @@ class AgentOutput(NamedTuple):
     """Negative evidence lower bound of the code, up to constants; 0 without a code."""
     message_loss: Float[Array, " N"] | None = None
     """The loss of the kind of message, where it has one."""
+    weighed: Weighed | None = None
+    """What the words were to who heard them; None for a kind without attention."""
+    gaze: torsos.Gaze | None = None
+    """Where the second look went; None without one."""
 
 
 class Seen(NamedTuple):
@@ -140,9 +144,17 @@ class AgentNetwork(eqx.Module):
         messages = spoken.messages
         if messages is not None:
             messages = jnp.where(observation.agent_mask[:, None], messages, 0.0)
-        hidden = spoken.hidden if self.look is None else self.look(spoken.hidden, seen.looked)
+        hidden, gaze = (spoken.hidden, None) if self.look is None else self.look(spoken.hidden, seen.looked)
         output = AgentOutput(
-            self.head(hidden), hidden, messages, adjacency, spoken.entropy, seen.code_loss, spoken.loss
+            head=self.head(hidden),
+            hidden=hidden,
+            messages=messages,
+            adjacency=adjacency,
+            entropy=spoken.entropy,
+            code_loss=seen.code_loss,
+            message_loss=spoken.loss,
+            weighed=spoken.weighed,
+            gaze=gaze,
         )
         return output, spoken.inbox
 

@@ -75,6 +75,12 @@ def attend(values: Float[Array, "N M H"], score: Float[Array, "N M"]) -> Float[A
     return jnp.einsum("nm,nmh->nh", weight, values) / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)
 
 
+def shares_of(score: Float[Array, "N M"]) -> Float[Array, "N M"]:
+    """Return the weights of that mean; 0 where every score is −∞."""
+    weight = jnp.exp(score - jnp.max(score, axis=1, keepdims=True, initial=-1e9))
+    return weight / jnp.maximum(weight.sum(1, keepdims=True), 1e-9)
+
+
 def attend_to_speakers(
     values: Float[Array, "N M H"], score: Float[Array, "N M"], spoke: Float[Array, "N M"]
 ) -> Float[Array, "N H"]:

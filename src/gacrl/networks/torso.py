@@ -33,6 +33,16 @@ class Looked(NamedTuple):
     """None for a torso that does not tell landmarks apart."""
     there: Bool[Array, "N L"] | None = None
     """Which of them are in sight."""
+    offsets: Float[Array, "N L 2"] | None = None
+    """Where they are, from each agent."""
+
+
+class Gaze(NamedTuple):
+    """Where a second look went: for whoever looks on."""
+
+    offsets: Float[Array, "N L 2"]
+    scores: Float[Array, "N L"]
+    """Whose softmax is the attention that each agent pays to the landmark there."""
 
 
 class MlpTorso(eqx.Module):
@@ -102,7 +112,7 @@ class GraphTorso(eqx.Module):
         others = self.agent(jnp.concatenate(others, axis=-1))
         crowd = _pool_max(others, agents.there, axis=1)
         hidden = self.out(jnp.concatenate([own, chosen, best, crowd], axis=-1))
-        return Looked(hidden, places, landmarks.there)
+        return Looked(hidden, places, landmarks.there, landmarks.offsets)
 
 
 class SecondLook(eqx.Module):
@@ -124,14 +134,15 @@ class SecondLook(eqx.Module):
         self.merge = Linear(2 * config.width, config.width, merge_key, gain)
         self.sharpness, self.slope = config.look_sharpness, config.heard_slope
 
-    def __call__(self, hidden: Float[Array, "N H"], looked: Looked) -> Float[Array, "N H"]:
+    def __call__(self, hidden: Float[Array, "N H"], looked: Looked) -> tuple[Float[Array, "N H"], Gaze]:
         places, there = looked.places, looked.there
-        assert places is not None and there is not None
+        assert places is not None and there is not None and looked.offsets is not None
         score = jnp.einsum("nh,nlh->nl", self.query(hidden), places) * (
             self.sharpness / math.sqrt(places.shape[-1])
         )
-        chosen = attend(places, jnp.where(there, score, -jnp.inf))
-        return hidden + rectified(self.merge(jnp.concatenate([hidden, chosen], axis=-1)), self.slope)
+        score = jnp.where(there, score, -jnp.inf)
+        merged = rectified(self.merge(jnp.concatenate([hidden, attend(places, score)], axis=-1)), self.slope)
+        return hidden + merged, Gaze(looked.offsets, score)
 
 
 class _Group(NamedTuple):

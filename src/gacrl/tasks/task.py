@@ -63,7 +63,8 @@ class Team(NamedTuple):
     params: Callable[[Settings, EnvParams, int, int], EnvParams]
     """(settings as asked for, params of a room with masks, its places, agents that are there) -> params."""
     join: Callable[[Settings, EnvState, EnvState, int, int], EnvState]
-    """(settings of the room, state, a fresh one, agents before, now) -> the state, newcomers as in the fresh one."""
+    """(settings of the room, state, a fresh one, agents before, now) -> the state, newcomers as in the fresh one. It is
+    compiled: the numbers of agents are traced."""
 
 
 class Case(NamedTuple):

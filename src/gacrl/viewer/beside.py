@@ -110,7 +110,7 @@ def _serve(asked: Mapping[str, Any]) -> None:
 
     prepare_jax()
     from gacrl.tasks import own
-    from gacrl.viewer import following, running
+    from gacrl.viewer import following, lore, running
     from gacrl.viewer.cast import open_cast
     from gacrl.viewer.server import Board
 
@@ -126,6 +126,7 @@ def _serve(asked: Mapping[str, Any]) -> None:
     listener = socket.socket(fileno=asked["socket"])
     server = Running(cast, listener, asked["host"], asked["token"], board)
     running.beside(lambda: following.follow(cast, board))
+    running.beside(lambda: lore.keep_telling(cast, board))
     print("page       is open", flush=True)
     server.run()
 

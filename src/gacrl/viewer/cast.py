@@ -2,43 +2,38 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 
 from gacrl import play, tasks
 from gacrl.config.checks import require
-from gacrl.envs.environment import Environment, EnvParams
+from gacrl.envs.environment import EnvParams
 from gacrl.errors import UserError
 from gacrl.evaluation import references
 from gacrl.export.html import UNBOUNDED
 from gacrl.export.replays import STEPS
+from gacrl.networks.agent import AgentNetwork
 from gacrl.networks.communication import kind_of
 from gacrl.play import TrainedRun
 from gacrl.tasks.task import Task
 from gacrl.training import build
 from gacrl.training.devices import one_seed
 from gacrl.training.trainer import AbstractTrainer
-from gacrl.types import Learner, Memory, Policy
+from gacrl.types import Learner, Policy
+from gacrl.viewer.hosted import HostRoom
 from gacrl.viewer.requests import Bounds
-from gacrl.viewer.rooms import Room
+from gacrl.viewer.rooms import Customs, Playable, Room
 
-_LADDER = (8, 32)
+_LADDER = (32,)
 """Places of the rooms for other numbers of agents than the task's own; the largest has the most that may come."""
 
+AnyRoom: TypeAlias = Room | HostRoom
 Change = Callable[[Any], Any]
 Warn = Callable[[str], None]
-
-
-class Playable(NamedTuple):
-    """A policy in an environment, apart from its parameters."""
-
-    env: Environment
-    policy: Callable[[Learner], Policy]
-    memory: Memory
 
 
 class Player:
@@ -50,6 +45,10 @@ class Player:
         """make: settings of the task -> the policy in it."""
         self.name, self.task, self.settings, self._make = name, task, settings, make
         self.learner, self.env_steps = learner, 0
+        self.sampled = False
+        """It draws what it does."""
+        self.draws = False
+        """Its head says how likely each action is, and not what it is worth."""
         self.opened: TrainedRun | None = None
         """None for a scripted policy."""
         self.nearest: int | None = None
@@ -60,7 +59,7 @@ class Player:
         """Agents that it can play with at the most; None: the task says."""
         self.vocabulary = 0
         """Symbols that it says; 0 for one that says none."""
-        self._rooms: dict[int, Room] = {}
+        self._rooms: dict[int, AnyRoom] = {}
         self._params: dict[tuple[int, int], EnvParams] = {}
         self._making = Lock()
         self.home = int(task.make(settings).num_agents)
@@ -91,7 +90,7 @@ class Player:
             return (self.home,)
         return self.home, *(size for size in _LADDER if size < most), most
 
-    def room(self, places: int) -> Room:
+    def room(self, places: int) -> AnyRoom:
         """Return the room of that size; nobody waits for one that is there while another is made."""
         if (found := self._rooms.get(places)) is not None:
             return found
@@ -100,19 +99,18 @@ class Player:
                 self._rooms[places] = self._furnished(places)
             return self._rooms[places]
 
-    def _furnished(self, places: int) -> Room:
+    def _furnished(self, places: int) -> AnyRoom:
         settings, task = self.sized(places), self.task
-        env, policy, memory = self._make(settings)
-        reach = self.reach is not None and task.team is not None
-        room = Room(
-            env=env,
-            policy=policy,
-            memory=memory,
+        customs = Customs(
             look=references.look_of(task, settings),
             measures=tuple(dict.fromkeys(self.measures.values())),
             edit=task.edit,
-            reach=reach,
+            join=None if task.team is None else partial(task.team.join, settings),
+            reach=self.reach is not None and task.team is not None,
+            nearest=self.nearest,
         )
+        playable = self._make(settings)
+        room = (HostRoom if playable.env.hosted else Room)(playable, customs)
         room.measure(self.learner, self.params(places, places))
         return room
 
@@ -124,9 +122,14 @@ class Player:
     @cached_property
     def measures(self) -> dict[str, str]:
         """What a page shows of each step besides the reward: {what it is called there: measurement}."""
-        world = self.task.world
-        known = None if world is None else world(self.task.make(self.settings), self.params(self.home, self.home))
-        return {} if known is None else {**known["measures"]}
+        return {**self.world.get("measures", {})}
+
+    @cached_property
+    def world(self) -> Mapping[str, Any]:
+        """The rules of the task, as an exported page has them; {} where it would know none."""
+        known = self.task.world
+        found = None if known is None else known(self.task.make(self.settings), self.params(self.home, self.home))
+        return {} if found is None else found
 
     def params(self, places: int, count: int) -> EnvParams:
         """Return the numbers of the task in the room of that size, with so many agents there."""
@@ -199,7 +202,7 @@ def _only_scripted(name: str) -> bool:
 def _require_shown(task: Task, settings: Any) -> None:
     env = task.make(settings)
     if env.hosted:
-        raise UserError(f"{task.name} lives in Python, where a page cannot step it: `gacrl render` records it")
+        return  # it draws itself, or says later that it cannot
     seen = jax.eval_shape(env.reset, jax.random.key(0), task.numbers(settings, env))[1]
     if task.scene is None and seen.positions is None:
         raise UserError(f"{task.name} does not say where things are: give its observations positions, or a scene")
@@ -243,10 +246,15 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
         def policy(numbers: Learner) -> Policy:
             return algorithm.policy(jax.tree.unflatten(structure, numbers), sampled)
 
-        return Playable(env, policy, trainer.memory)
+        def network(numbers: Learner) -> AgentNetwork:
+            assert algorithm.network is not None
+            return algorithm.network(jax.tree.unflatten(structure, numbers))
+
+        return Playable(env, policy, trainer.memory, None if algorithm.network is None else network)
 
     player = Player(name, opened.task, opened.config.env, make, acting(opened))
-    player.opened, player.env_steps = opened, opened.env_steps
+    player.opened, player.env_steps, player.sampled = opened, opened.env_steps, sampled
+    player.draws = opened.trainer.algorithm.draws
     network = getattr(opened.config.algorithm, "network", None)
     if network is not None:
         player.nearest, player.reach = network.nearest_agents, network.radius
@@ -259,8 +267,8 @@ def trained(opened: TrainedRun, name: str, sampled: bool = False) -> Player:
 
 
 def acting(opened: TrainedRun) -> list[jax.Array]:
-    """Return the numbers with which the first seed acts."""
-    return jax.tree.leaves(one_seed(opened.learners, 0))
+    """Return the numbers with which the first seed acts, as they are without a mesh of devices."""
+    return jax.device_put(jax.device_get(jax.tree.leaves(one_seed(opened.learners, 0))))
 
 
 def _acts(trainer: AbstractTrainer) -> Learner:

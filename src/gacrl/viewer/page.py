@@ -29,12 +29,13 @@ def page_data(cast: Cast) -> dict[str, Any]:
     return {
         **common(cast.task, cast.settings, " and ".join(names)),
         "measures": first.measures,
-        "world": {"num_agents": first.home},
+        "world": {**first.world, "num_agents": first.home},
         "network": {
             "settings": {
                 "communication": "some" if bounds.rounds else "none",
                 "rounds": bounds.rounds,
                 "vocabulary": bounds.vocabulary,
+                "draws": first.draws,
             }
         },
         "facts": {

@@ -3,9 +3,12 @@
 import secrets
 import socket
 import threading
+import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import chain, pairwise, zip_longest
 
 import uvicorn
 
@@ -16,8 +19,8 @@ from gacrl.viewer.page import page
 from gacrl.viewer.requests import MOST_BYTES
 from gacrl.viewer.server import Board, Server
 
-_FIRST_PICTURE = 30.0
-"""Seconds that the compiler waits for a visitor, who would otherwise wait for it."""
+_POLITE = 0.02
+"""Seconds after which the compiler asks again whether somebody is being answered."""
 
 
 def new_token() -> str:
@@ -107,22 +110,34 @@ class Running:
 def warm_up(cast: Cast) -> None:
     """Compile what the first picture needs."""
     for player in cast.players:
-        player.room(player.home).warm(player.learner, player.params(player.home, player.home))
+        deque(player.room(player.home).warm(player.learner, player.params(player.home, player.home)), maxlen=0)
 
 
-def warm_up_the_rest(cast: Cast, shown: threading.Event) -> None:
-    """Compile the rooms for other numbers of agents, smallest first, once a first picture is shown."""
-    shown.wait(_FIRST_PICTURE)
+def warm_up_the_rest(cast: Cast, busy: Callable[[], bool]) -> None:
+    """Compile the rooms for other numbers of agents: first of each what answers a visitor who asks for it.
+
+    busy: whether somebody is being answered, who goes first. (A thread of low priority would hold the interpreter's
+    lock for as long as the machine has other things to do, and everyone would wait for it.)
+    """
     least, most = cast.bounds.least, cast.bounds.most
-    for player in cast.players if least < most else ():
-        for size in player.sizes[1:]:
-            player.room(size).warm(player.learner, player.params(size, size))
-            if size >= most:
-                break
+    under_way = [
+        player.room(size).warm(player.learner, player.params(size, size))
+        for player in (cast.players if least < most else ())
+        for smaller, size in pairwise(player.sizes)
+        if smaller < most
+    ]
+    for _ in chain.from_iterable(zip_longest(*under_way)):  # the first program of each, then the second
+        while busy():
+            time.sleep(_POLITE)
 
 
-def beside(work: Callable[[], None]) -> threading.Thread:
-    """Do something in a thread that ends with the process."""
-    thread = threading.Thread(target=work, daemon=True)
+def beside(*work: Callable[[], None]) -> threading.Thread:
+    """Do some things, one after the other, in a thread that ends with the process."""
+
+    def one_by_one() -> None:
+        for each in work:
+            each()
+
+    thread = threading.Thread(target=one_by_one, daemon=True)
     thread.start()
     return thread

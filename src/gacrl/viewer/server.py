@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import json
 import sys
-import threading
 import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -32,6 +31,8 @@ from gacrl.viewer.show import Show
 MOST_VISITORS = 8
 PATIENCE = 20.0
 """Seconds that a visitor may take to take what is sent."""
+_SLICE = 0.1
+"""Seconds after which a visitor who jumped far ahead lets the others have their turn."""
 _A_SECOND, _AT_ONCE = 100.0, 200.0
 """Messages that a visitor may send, and how many of them in a burst."""
 _HEADERS = {
@@ -109,13 +110,15 @@ class Visit:
         return self._frames is not None
 
     def play(self) -> str | None:
-        """Play the next frame that is asked for, and return it as text; None where it is not wanted any more."""
+        """Play toward the next frame that is asked for, and return it as text; None where it is not there yet."""
         wanted, frames = self._wanted, self._frames
         if wanted is None or frames is None:
             return None
         if wanted.version != self._version:
             self.show.take(wanted.scene)
             self._version = wanted.version
+        if not self.show.toward(frames.first, _SLICE):
+            return None
         shown = self.show.frame(frames.first)
         if self._frames is frames:
             rest = frames._replace(first=frames.first + 1)
@@ -143,16 +146,18 @@ class Server:
         """page: the host of the socket -> the page."""
         self.cast, self.board = cast, Board() if board is None else board
         self._page = page
-        self._stage = ThreadPoolExecutor(1, "stage")
+        self._stage, self._answering = ThreadPoolExecutor(1, "stage"), 0
         self.visitors = 0
-        self.shown = threading.Event()
-        """Somebody has seen a frame."""
         routes = [
             Route("/", self._get_page),
             Route("/favicon.ico", lambda request: Response(status_code=204)),
             WebSocketRoute("/live", self._live),
         ]
         self.app: ASGIApp = _Guarded(Starlette(routes=routes), guard)
+
+    def busy(self) -> bool:
+        """Return whether somebody waits for a frame."""
+        return self._answering > 0
 
     async def _get_page(self, request: HttpRequest) -> Response:
         return HTMLResponse(self._page(same_site(request.headers)))
@@ -196,7 +201,6 @@ class Server:
                 text = await self._played(visit)
                 if text is not None:
                     await self._send(socket, text)
-                    self.shown.set()
                 continue
             visit.news.clear()
             if not (visit.waits or visit.refusal):
@@ -205,12 +209,15 @@ class Server:
 
     async def _played(self, visit: Visit) -> str | None:
         """Play a frame in the thread of the stage; what a task's code raises is told to the visitor, and printed."""
+        self._answering += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._stage, visit.play)
         except UserError as error:
             says = str(error)
         except Exception as error:  # a task's own code may raise anything; the other visitors go on
             says = f"the task or the policy raised {type(error).__name__}: {error}"
+        finally:
+            self._answering -= 1
         print(f"gacrl: {says}", file=sys.stderr)
         visit.forget()
         return json.dumps({"kind": "error", "says": says})

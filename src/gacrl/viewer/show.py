@@ -4,6 +4,8 @@ A scene is a seed and a list of what was done at which step, so that everything 
 up to the first step that changed, and the rest is played again when it is asked for.
 """
 
+import math
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,10 +15,10 @@ import numpy as np
 from gacrl.envs.environment import EnvState
 from gacrl.scene import Edit, Placed
 from gacrl.types import Learner
-from gacrl.viewer.cast import Cast, Player
+from gacrl.viewer.cast import AnyRoom, Cast, Player
 from gacrl.viewer.pictures import picture
 from gacrl.viewer.requests import MOST_SEED, Event, Scene, Standing, first_difference, standing
-from gacrl.viewer.rooms import Decided, Meddling, Room, Stood
+from gacrl.viewer.rooms import Decided, Meddling, Stood
 
 _MEDDLING = ("fate", "radius", "cut")
 """What is done to words and edges. Everything else happens in the untouched run as well."""
@@ -31,7 +33,7 @@ LOST = 0.5
 class Moment(NamedTuple):
     """What is kept of a step."""
 
-    room: Room
+    room: AnyRoom
     places: int
     team: int
     """Agents that are there."""
@@ -78,9 +80,27 @@ class Lane:
 
     def through(self, t: int) -> Moment:
         """Return step t, or the last one of an episode that is over before."""
-        while len(self.moments) <= t and not (self.moments and self.moments[-1].over):
+        while not self.knows(t):
             self.moments.append(self._next())
         return self.moments[min(t, len(self.moments) - 1)]
+
+    def toward(self, t: int, ends: float) -> bool:
+        """Play on to step t until the clock says `ends`; returns whether it is there."""
+        if self._elsewhere is not None and self._scrambled(t) and not self._elsewhere.toward(t, ends):
+            return False
+        while not self.knows(t):
+            self.moments.append(self._next())
+            if time.monotonic() > ends:
+                break
+        return self.knows(t)
+
+    def knows(self, t: int) -> bool:
+        """Return whether step t is played, or the episode is over before."""
+        return len(self.moments) > t or bool(self.moments and self.moments[-1].over)
+
+    def _scrambled(self, t: int) -> bool:
+        events = () if self.scene is None else self.scene.events
+        return any(event.fate is not None and event.fate.kind == "scramble" for event in events if event.at <= t)
 
     def _next(self) -> Moment:
         scene, player, t = self.scene, self.player, len(self.moments)
@@ -101,8 +121,10 @@ class Lane:
         seen = jax.device_get(decided._replace(memory=()))
         if t == 0:
             self.size = float(np.ptp(seen.scene.agents.positions, axis=0).max(initial=0.0)) / 20
-        shown = picture(seen, now, meddling, player.nearest, self.size)
+        shown = picture(seen, now, meddling, self.size)
         shown |= {"earned": round(earned, 4), "measured": measured, "over": over, "count": now}
+        drawn = room.drawn(stood.state)
+        shown |= {} if drawn is None else {"drawn": drawn}
         return Moment(room, places, now, stood.state, decided, seen.messages, earned, measured, over, shown)
 
     def _stepped(self, scene: Scene, t: int) -> tuple[int, int, Stood, float, dict[str, float], bool]:
@@ -126,13 +148,11 @@ class Lane:
 
     def _resized(self, stood: Stood, places: int, count: int, now: int, t: int) -> tuple[int, Stood]:
         """Let agents come or go, in a larger room where this one has too few places."""
-        player, team, scene = self.player, self.player.task.team, self.scene
-        assert team is not None and scene is not None, "only a task with a team has agents that come and go"
+        player, scene = self.player, self.scene
+        assert scene is not None, "a lane takes a scene first"
         wider = places if places >= now and places != player.home else player.places_beside(now)
         room, params = player.room(wider), player.params(wider, now)
-        fresh = room.fresh(params, scene.seed, t)
-        state = team.join(player.sized(wider), grown(stood.state, fresh), fresh, count, now)
-        return wider, room.entered(params, state)
+        return wider, room.joined(params, stood.state, count, now, scene.seed, t)
 
     def _meddling(self, rules: Standing, t: int, places: int) -> Meddling | None:
         """Return what happens to the words of step t, in numbers."""
@@ -140,8 +160,9 @@ class Lane:
         if shape is None:
             return None
         rounds, agents, symbols = shape
-        values, replaced = np.zeros(shape, np.float32), np.zeros((rounds, agents), bool)
-        other, kept = np.arange(agents), np.ones((agents, agents), bool)
+        radius = (self.player.reach or 0.0) if rules.radius is None else rules.radius
+        meddling = Meddling.none(shape)._replace(radius=float(radius))
+        values, replaced, other, kept, _ = meddling
         for one, two in rules.cuts:
             if max(one, two) < agents:
                 kept[one, two] = kept[two, one] = False
@@ -163,8 +184,7 @@ class Lane:
                 for number, word in enumerate(fate.spoken[:rounds]):
                     if word < symbols:
                         values[number, agent, word], replaced[number, agent] = 1.0, True
-        radius = (self.player.reach or 0.0) if rules.radius is None else rules.radius
-        return Meddling(values, replaced, other, kept, float(radius))
+        return meddling
 
     @property
     def _seed(self) -> int:
@@ -200,16 +220,30 @@ class Show:
 
         An episode that ends before is at its last step there.
         """
-        assert self.scene is not None, "a show takes a scene first"
-        main = self.main.through(t)
-        begins = next((event.at for event in self.scene.events if event.kind in _MEDDLING), None)
-        if not self._rivals and begins is None:
-            return {"t": t, "main": main.shown, "twin": None}
-        if not self._rivals and begins is not None:  # until then nothing was meddled with
+        self.toward(t)
+        twin = self.twin.through(t).shown if self._twinned else None
+        return {"t": t, "main": self.main.through(t).shown, "twin": twin}
+
+    def toward(self, t: int, patience: float = math.inf) -> bool:
+        """Play on to step t for so many seconds; returns whether it can be shown now. Ask again to go on."""
+        ends = time.monotonic() + patience
+        if not self.main.toward(t, ends) or not self._twinned:
+            return self.main.knows(t)
+        if not self._rivals:  # until then nothing was meddled with
             known = len(self.twin.moments)
-            self.twin.moments += self.main.moments[known:begins]
+            self.twin.moments += self.main.moments[known : self._begins]
             self.twin.size = self.main.size
-        return {"t": t, "main": main.shown, "twin": self.twin.through(t).shown}
+        return self.twin.toward(t, ends)
+
+    @property
+    def _begins(self) -> int | None:
+        """The step in which words or edges are meddled with for the first time."""
+        assert self.scene is not None, "a show takes a scene first"
+        return next((event.at for event in self.scene.events if event.kind in _MEDDLING), None)
+
+    @property
+    def _twinned(self) -> bool:
+        return self._rivals or self._begins is not None
 
 
 def untouched(scene: Scene) -> tuple[Event, ...]:
@@ -217,17 +251,7 @@ def untouched(scene: Scene) -> tuple[Event, ...]:
     return tuple(event for event in scene.events if event.kind not in _MEDDLING)
 
 
-def grown(state: EnvState, fresh: EnvState) -> EnvState:
-    """Return a state at the beginning of a larger one's arrays."""
-
-    def grow(old: Any, new: Any) -> Any:
-        corner = tuple(slice(0, size) for size in np.shape(old))
-        return old if np.shape(old) == np.shape(new) else new.at[corner].set(old)
-
-    return jax.tree.map(grow, state, fresh)
-
-
-def _hand(here: Sequence[Event], places: int, count: int, room: Room, stood: Stood) -> Edit | None:
+def _hand(here: Sequence[Event], places: int, count: int, room: AnyRoom, stood: Stood) -> Edit | None:
     """Return what a hand moves in a step, the last place of each thing; None where it moves nothing."""
     moves = [event for event in here if event.kind == "move"]
     if not moves:

@@ -1,9 +1,9 @@
 // Buttons, keys and the pointer: each does one of the things in `act`.
 
 import { byId } from "./elements.js";
+import { REACH, speedOptions } from "./habits.js";
 
 const NUDGE = 0.05;
-const REACH = 1.6;  // a thing is caught within so many of its radii
 
 // act: what can be done, as `main.js` has it; view: the picture that the pointer is on.
 export function connect(act, view) {
@@ -12,6 +12,7 @@ export function connect(act, view) {
     fewer: act.remove, more: act.add, cut: () => act.cut(Number(byId("cut-a").value), Number(byId("cut-b").value)), copy: act.copy, hush: act.hush,
   };
   for (const [id, does] of Object.entries(buttons)) byId(id).addEventListener("click", does);
+  byId("speed").replaceChildren(...speedOptions());
   byId("scrub").addEventListener("input", (event) => act.seek(Number(event.target.value)));
   byId("speed").addEventListener("change", (event) => act.speed(Number(event.target.value)));
   byId("radius").addEventListener("input", (event) => act.radius(Number(event.target.value)));

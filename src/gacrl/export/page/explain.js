@@ -1,5 +1,6 @@
 // Says in words what an agent sees, hears, says and does, and what a word goes with.
 
+import { softmax } from "./numbers.js";
 import { colourName, letter } from "./palette.js";
 import { FATES } from "./words.js";
 
@@ -21,8 +22,23 @@ export function aboutAgent(frame, index, page, rules) {
     const at = looks.map((look) => `${percent(look.share)} ${markName(scene, look.index, page.words)}`);
     lines.push(["Then looks at", at.join(", ")]);
   }
-  if (decision.actions) lines.push(["Next", actionName(page, decision.actions[index])]);
+  if (decision.actions) {
+    const share = page.network?.settings.draws ? actionShares(frame, index).get(decision.actions[index]) : undefined;
+    lines.push(["Next", actionName(page, decision.actions[index]) + (share === undefined ? "" : ` (${percent(share)})`)]);
+  }
   return lines;
+}
+
+// What the head says of each action that an agent has: {action: number}.
+export function actionValues({ decision, seen }, index) {
+  const allowed = seen?.[index]?.available, has = (value, action) => value !== null && (allowed?.[action] ?? true);
+  return new Map([...(decision.values?.[index] ?? [])].map((value, action) => [action, value]).filter(([action, value]) => has(value, action)));
+}
+
+// The chance of each action, of a policy that draws: {action: share}.
+export function actionShares(frame, index) {
+  const values = actionValues(frame, index), shares = softmax([...values.values()]);
+  return new Map([...values.keys()].map((action, k) => [action, shares[k]]));
 }
 
 function sees(seen, scene, words) {
@@ -30,7 +46,7 @@ function sees(seen, scene, words) {
   const name = (thing, what) => `${what} ${towards(thing)}`;
   const marks = near(seen.landmarks).map((it) => name(it, markName(scene, it.index, words)));
   const agents = near(seen.agents).map((it) => name(it, `${words.agent} ${it.index}`));
-  const rest = seen.landmarks.length + seen.agents.length - marks.length - agents.length;
+  const rest = seen.landmarks.length + seen.agents.length + (seen.more ?? 0) - marks.length - agents.length;
   const all = [...marks, ...agents, ...(rest > 0 ? [`${rest} more`] : [])];
   return all.length > 0 ? all.join("; ") : "nothing";
 }
@@ -59,11 +75,9 @@ export function aboutWord(dictionary, agent, round, symbol, page) {
   const who = entry.agent < 0 ? "all agents" : `agent ${entry.agent}`;
   const start = `${letter(symbol)} in round ${round + 1}: ${percent(entry.share)} of what ${who} say${entry.agent < 0 ? "" : "s"} there.`;
   if (!entry.direction) return `${start} Nobody hears it.`;
-  const whom = entry.of === "heard" ? "Who hears it" : "Who says it";
-  const goal = entry.goal[0] >= 0 ? ` has to go to ${colourName(entry.goal[0])} (${percent(entry.goal[1])});` : "";
-  const place = entry.of === "heard" && goal ? "that lies" : `the nearest ${page.words.mark} lies`;
-  const where = COMPASS[entry.direction[0]];
-  return `${start} ${whom}${goal || ":"} ${place} ${where} most often (${percent(entry.direction[1])}), ${far(entry.distance)} away on average; `
+  const goal = entry.goal[0] >= 0 ? `Who hears it most often has to go to ${colourName(entry.goal[0])} (${percent(entry.goal[1])}). That` : "";
+  const place = entry.of === "heard" && goal ? `${goal} lies` : `For who ${entry.of === "heard" ? "hears" : "says"} it the nearest ${page.words.mark} lies`;
+  return `${start} ${place} ${COMPASS[entry.direction[0]]} (${percent(entry.direction[1])}), ${far(entry.distance)} away on average; `
     + `the next action is “${actionName(page, entry.action[0])}” (${percent(entry.action[1])}).`;
 }
 

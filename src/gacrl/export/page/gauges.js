@@ -13,17 +13,23 @@ export function drawGauges(page, session, t) {
   if (page.measures[COLLISIONS]) rows.push(["Collisions", (frame) => frame.totals.collisions, COLLISIONS, (x) => String(Math.round(x))]);
   const comparable = session.start.count === page.world?.num_agents && main.scene.agents.length === session.start.count;
   const yardsticks = comparable ? names : [];
-  const head = ["", session.names?.main ?? (twin ? "Here" : "Now"), ...(twin ? [session.names?.twin ?? "Untouched"] : []), ...yardsticks];
-  const cells = rows.map(([label, of, measure, format]) => [
-    label, format(of(main)), ...(twin ? [format(of(twin))] : []),
-    ...yardsticks.map((name) => (t === 0 && measure !== "share" ? format(0) : format(page.yardsticks[name][measure][Math.max(t - 1, 0)]))),
-  ]);
+  const head = ["", ...rows.map(([label]) => label)];
+  const lane = (name, frame) => [name, ...rows.map(([, of, , format]) => format(of(frame)))];
+  const cells = [
+    lane(session.names?.main ?? (twin ? "Here" : "Now"), main), ...(twin ? [lane(session.names?.twin ?? "Untouched", twin)] : []),
+    ...yardsticks.map((name) => [name, ...rows.map(([, , measure, format]) => (
+      t === 0 && measure !== "share" ? format(0) : known(page.yardsticks[name][measure], t, format)))]),
+  ];
   const table = byId("gauges"), text = JSON.stringify([head, cells]);
   if (table.dataset.shown === text) return;
   table.dataset.shown = text;
   const line = (texts, tag) => make("tr", {}, ...texts.map((it, k) => make(k === 0 ? "th" : tag, { scope: tag === "th" ? "col" : k === 0 ? "row" : null }, it)));
   table.tHead.replaceChildren(line(head, "th"));
   table.tBodies[0].replaceChildren(...cells.map((row) => line(row, "td")));
+}
+
+function known(curve, t, format) {
+  return curve === undefined ? "" : format(curve[Math.min(Math.max(t - 1, 0), curve.length - 1)]);
 }
 
 // Returns so far of both lanes and of the yardsticks, as curves with their names at the end.
@@ -35,7 +41,7 @@ export function drawCurves(canvas, page, session, t, theme) {
   pen.clearRect(0, 0, width, height);
   const lane = (frames) => frames.slice(0, t + 1).map((frame) => frame.totals.return);
   const known = session.main.frames[t].scene.agents.length === page.world?.num_agents ? page.yardsticks : {};
-  const curves = Object.entries(known).map(([name, it]) => ({ name, values: [0, ...it.return], colour: theme.faint, dash: [4, 3] }));
+  const curves = Object.entries(known).map(([name, it]) => ({ name, values: [0, ...it.return].slice(0, session.length + 1), colour: theme.faint, dash: [4, 3] }));
   if (session.meddled) curves.push({ name: session.names?.twin ?? "untouched", values: lane(session.twin.frames), colour: theme.edge, dash: [] });
   curves.push({ name: session.names?.main ?? (session.meddled ? "here" : "now"), values: lane(session.main.frames), colour: session.meddled ? theme.alarm : theme.edge, dash: [] });
   const least = Math.min(-1e-6, ...curves.flatMap((curve) => curve.values)), most = Math.max(0, ...curves.flatMap((curve) => curve.values));

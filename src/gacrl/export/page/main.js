@@ -4,22 +4,22 @@ import { connect } from "./controls.js";
 import { byId, make, say } from "./elements.js";
 import { aboutWord } from "./explain.js";
 import { drawCurves, drawGauges } from "./gauges.js";
+import { NORMAL, SPEEDS } from "./habits.js";
 import { Inspector } from "./inspector.js";
 import { written } from "./link.js";
 import { open } from "./opening.js";
 import { theme } from "./palette.js";
 import { areaOf, SceneView } from "./scene.js";
 import { edgeName } from "./story.js";
-import { verdict } from "./verdict.js";
+import { meddledWith, verdict } from "./verdict.js";
 import { Voices } from "./voices.js";
 
-const SPEEDS = [2, 5, 10, 25];  // steps a second
 const WORK = 7;  // milliseconds of each frame for steps to come
 const REST = 1800;  // milliseconds between an episode and the next one
 
 const page = JSON.parse(byId("data").textContent);
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-const still = { t: 0, playing: false, speed: 5, selected: null, hovered: null, held: null, over: 0 };
+const still = { t: 0, playing: false, speed: NORMAL, selected: null, hovered: null, held: null, over: 0 };
 
 const { session, asked } = await open(page);
 const view = new SceneView(byId("scene"), page.colours), twinView = new SceneView(byId("twin"), page.colours);
@@ -202,7 +202,7 @@ function draw() {
   const t = now(), rules = session.standing(t), meddled = session.meddled;
   const selected = still.hovered ?? still.selected ?? null;
   byId("right").hidden = !meddled;
-  say(byId("left-name"), session.names?.main ?? (meddled ? "With what you changed" : ""));
+  say(byId("left-name"), session.names?.main ?? (meddled ? meddledWith(session, t) : ""));
   if (session.names !== null) say(byId("right-name"), session.names.twin);
   const lanes = [session.main, ...(meddled ? [session.twin] : [])];
   const area = areaOf(lanes.flatMap((lane) => lane.frames.slice(0, t + 2)));
@@ -263,6 +263,10 @@ function introduce() {
 
 function invitation(talks) {
   if (!talks) return "";
+  if (page.world?.knows) {
+    return "Each agent has to reach the landmark at the end of its dotted line, and only another agent knows which one that is. The letters are what they tell each other. "
+      + "Silence an agent and watch.";
+  }
   if (page.replays) return "The letters are what they say. Silence everyone and watch what they do without their words.";
   if (session.world.most > session.world.least) return "The letters are what they say. Drag a landmark, add agents, or silence everyone: do they need their words?";
   return "The letters are what they say. Silence an agent and watch what the others do without its words.";

@@ -1,5 +1,6 @@
 // What an exported page shows: an episode that it plays itself, or recorded ones.
 
+import { FIRST } from "./habits.js";
 import { understood } from "./link.js";
 import { NavigationWorld } from "./navigation.js";
 import { policyFrom } from "./policy.js";
@@ -8,7 +9,6 @@ import { Session } from "./session.js";
 import { SpreadWorld } from "./spread.js";
 
 const WORLDS = { spread: SpreadWorld, navigation: NavigationWorld };
-const FIRST = 3;  // the seed that opens a page: a start in which agents with goals have different ones
 
 // The session of a page, and what its address asks for, or null.
 export function open(page) {

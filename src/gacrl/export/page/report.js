@@ -2,15 +2,13 @@
 
 import { byId, make, say } from "./elements.js";
 import { aboutAgent } from "./explain.js";
+import { NORMAL, REACH, speedOptions } from "./habits.js";
 import { theme } from "./palette.js";
 import { framesOf } from "./recording.js";
 import { areaOf, SceneView } from "./scene.js";
 
-const SPEEDS = [2, 5, 10, 25];  // steps a second
-const REACH = 1.6;  // an agent is caught within so many of its radii
-
 const page = JSON.parse(byId("live-data").textContent);
-const still = { group: 0, episode: 0, t: 0, playing: false, speed: 5, agent: 0, frames: [], area: null };
+const still = { group: 0, episode: 0, t: 0, playing: false, speed: NORMAL, loop: 0, agent: 0, frames: [], area: null };
 
 const canvas = make("canvas", { id: "live-canvas", tabindex: 0, role: "img", "aria-describedby": "live-keys" });
 const groups = make("select", { onchange: () => act.open(Number(groups.value), 0) }, ...page.groups.map((group, k) => make("option", { value: k }, group.name)));
@@ -18,8 +16,7 @@ const episodes = make("select", { onchange: () => act.open(still.group, Number(e
 const play = make("button", { type: "button", class: "main", onclick: () => act.toggle() }, "Play");
 const scrub = make("input", { type: "range", min: 0, value: 0, step: 1, "aria-label": "Step", oninput: () => act.seek(Number(scrub.value)) });
 const step = make("output"), told = make("p", { class: "told", role: "status" }), name = make("h3"), about = make("dl");
-const speed = make("select", { onchange: () => { still.speed = Number(speed.value); } },
-  ...SPEEDS.map((it, k) => make("option", { value: it, selected: it === still.speed }, ["slow", "normal", "fast", "very fast"][k])));
+const speed = make("select", { onchange: () => { still.speed = Number(speed.value); } }, ...speedOptions());
 const view = new SceneView(canvas, page.colours);
 
 const act = {
@@ -42,7 +39,8 @@ const act = {
     if (!still.playing && still.t >= last()) still.t = 0;
     still.playing = !still.playing;
     draw();
-    if (still.playing) requestAnimationFrame(() => pass(performance.now()));
+    still.loop += 1;
+    if (still.playing) pass(performance.now(), still.loop);
   },
   seek(t) {
     still.playing = false;
@@ -63,14 +61,14 @@ function title({ rank, value, seed, number }) {
   return `${rank}: ${page.measure} ${value.toFixed(2)}, seed ${seed}, episode ${number}`.replace("-", "\u2212");
 }
 
-// Time passes while an episode plays: frame after frame until its end.
-function pass(before) {
+// Time passes while an episode plays: frame after frame until its end, or until somebody starts it anew.
+function pass(before, loop) {
   requestAnimationFrame((time) => {
-    if (!still.playing) return;
-    still.t = Math.min(still.t + (Math.min(time - before, 250) / 1000) * still.speed, last());
+    if (!still.playing || loop !== still.loop) return;
+    still.t = Math.min(still.t + (Math.max(0, Math.min(time - before, 250)) / 1000) * still.speed, last());
     if (still.t >= last()) still.playing = false;
     draw();
-    pass(time);
+    pass(time, loop);
   });
 }
 

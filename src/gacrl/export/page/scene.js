@@ -15,6 +15,7 @@ export class SceneView {
     this.colours = colours;
     this.size = 0;
     this.words = [];
+    this.drawn = this.bitmap = null;
   }
 
   // Fit the canvas to its place on the page, sharp on every screen.
@@ -88,8 +89,22 @@ export class SceneView {
       const [left, top] = this.place(scene.ground[0], scene.ground[3]), [right, bottom] = this.place(scene.ground[2], scene.ground[1]);
       pen.fillStyle = theme.ground;
       pen.fillRect(left, top, right - left, bottom - top);
+      if (scene.drawn) this.backdrop(scene.drawn, left, top, right - left, bottom - top);
     }
     for (const [x0, y0, x1, y1] of scene.lines ?? []) this.line(this.place(x0, y0), this.place(x1, y1), theme.border, 2);
+  }
+
+  // What the task itself draws, as large as it goes: the last picture until this one is decoded.
+  backdrop(drawn, left, top, width, height) {
+    if (this.drawn !== drawn) {
+      this.drawn = drawn;
+      const bytes = Uint8Array.from(atob(drawn), (sign) => sign.charCodeAt(0));
+      createImageBitmap(new Blob([bytes], { type: "image/png" })).then((bitmap) => { if (this.drawn === drawn) this.bitmap = bitmap; });
+    }
+    if (!this.bitmap) return;
+    const scale = Math.min(width / this.bitmap.width, height / this.bitmap.height);
+    const [wide, high] = [this.bitmap.width * scale, this.bitmap.height * scale];
+    this.pen.drawImage(this.bitmap, left + (width - wide) / 2, top + (height - high) / 2, wide, high);
   }
 
   line([x0, y0], [x1, y1], colour, width, dash = [], alpha = 1) {

@@ -2,11 +2,11 @@
 
 import { dressed, shareLit } from "./dressing.js";
 import { byId, make, say } from "./elements.js";
+import { FIRST } from "./habits.js";
 import { drawLearning } from "./learning.js";
 import { understood } from "./link.js";
 import { MEDDLING, Story } from "./story.js";
 
-const OPENING = 3;  // the seed that opens a page
 const AHEAD = 24;  // frames that are asked for before they are shown
 const PACE = 40;  // milliseconds between two messages of a hand that drags
 const MOST = 64;  // frames in one message
@@ -18,7 +18,7 @@ export async function open(page) {
   const { facts } = page, world = { ...facts, add: facts.most > facts.least, remove: facts.most > facts.least };
   const policy = { settings: page.network.settings };
   const asked = understood(location.hash, world, policy);
-  const start = asked === null ? { seed: OPENING, count: facts.count } : { seed: asked.seed, count: asked.count };
+  const start = asked === null ? { seed: FIRST, count: facts.count } : { seed: asked.seed, count: asked.count };
   const session = new Served(page, world, policy, start, asked?.events ?? []);
   await session.opened;
   return { session, asked };
@@ -27,7 +27,7 @@ export async function open(page) {
 class Served extends Story {
   constructor(page, world, policy, start, events) {
     super(start, events, page.facts.radius);
-    Object.assign(this, { world, policy, length: world.length, names: page.facts.names, movable: page.facts.movable, reaches: page.facts.radius !== null });
+    Object.assign(this, { page, world, policy, length: world.length, names: page.facts.names, movable: page.facts.movable, reaches: page.facts.radius !== null });
     this.main = { frames: [] };
     this.twin = { frames: [] };
     this.fresh = 0;  // so many frames are of the scene as it is; later ones are on their way
@@ -164,6 +164,10 @@ class Line {
     } else if (message.kind === "learning") {
       session.revision += 1;
       drawLearning(message);
+    } else if (message.kind === "known" || message.kind === "words") {
+      const { kind, ...found } = message;
+      Object.assign(session.page, found);
+      session.revision += 1;
     }
   }
 
@@ -173,18 +177,42 @@ class Line {
   }
 }
 
-// A frame as the page knows it, of what `gacrl.viewer.pictures` wrote.
+// A frame as the page knows it, of what `gacrl.viewer.pictures` wrote: shares are whole percents there.
 function frameOf(shown) {
   const agents = discs(shown.agents), marks = discs(shown.marks);
   const decision = {
-    said: shown.said, arrived: shown.arrived, hears: shown.hears, heeded: [], looks: agents.map(() => []), actions: shown.actions,
+    said: shown.said, arrived: shown.arrived, hears: shown.hears, actions: shown.actions, values: shown.values,
+    heeded: shown.heeded ? [shown.heeded.map((row) => row.map((percent) => percent / 100))] : [],
+    wordShares: shown.words?.map((round) => round.map(sparse)),
+    looks: agents.map((_, i) => inPairs(shown.looks?.[i] ?? []).map(([index, percent]) => ({ index, share: percent / 100 }))),
   };
   return {
-    scene: dressed(agents, marks, shown.lines, shown.ground), decision, share: shown.measured.share ?? shareLit(marks),
+    seen: shown.sees?.map((sees, i) => sightOf(sees, agents[i], agents, marks)),
+    scene: { ...dressed(agents, marks, shown.lines, shown.ground), drawn: shown.drawn ?? null }, decision, share: shown.measured.share ?? shareLit(marks),
     totals: { return: shown.earned, collisions: 0, ...shown.measured },
   };
 }
 
 function discs({ x, y, radius, there, lit, colour }) {
   return x.map((_, k) => ({ x: x[k], y: y[k], radius: radius[k], there: there[k], lit: lit[k], colour: colour[k] }));
+}
+
+// The likeliest words and their chances, each at the place of its symbol.
+function sparse(numbers) {
+  const shares = [];
+  for (const [symbol, percent] of inPairs(numbers)) shares[symbol] = percent / 100;
+  return shares;
+}
+
+function inPairs(numbers) {
+  return Array.from({ length: numbers.length / 2 }, (_, k) => numbers.slice(2 * k, 2 * k + 2));
+}
+
+// What one agent sees, as a world's `observe` has it: the nearest things, and how many besides.
+function sightOf([landmarks, others, more], { x, y }, agents, marks) {
+  const from = (things) => (index) => {
+    const offset = { x: things[index].x - x, y: things[index].y - y };
+    return { ...offset, index, squared: offset.x ** 2 + offset.y ** 2 };
+  };
+  return { landmarks: landmarks.map(from(marks)), agents: others.map(from(agents)), more };
 }

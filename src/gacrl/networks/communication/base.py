@@ -52,6 +52,18 @@ class Neighbourhood(NamedTuple):
         return jnp.broadcast_to(jnp.eye(num_agents), (num_agents, count, num_agents))
 
 
+class Weighed(NamedTuple):
+    """How words came about and what they were worth to who heard them, for whoever looks on.
+
+    A tuple has an entry for each round, as it was computed on the way: no learner reads them, and none pays for them.
+    """
+
+    scores: tuple[Float[Array, "N S"], ...]
+    """Whose softmax is the attention that each agent pays to its K speakers (and perhaps, behind them, to itself)."""
+    logits: tuple[Float[Array, "N V"], ...] = ()
+    """Of the symbols that each agent could send; () where words are no symbols."""
+
+
 class Spoken(NamedTuple):
     """What came of a step's conversation."""
 
@@ -64,6 +76,8 @@ class Spoken(NamedTuple):
     """Of the symbols sent, in nats, mean over the rounds."""
     loss: Float[Array, " N"] | None = None
     """The kind's own, for each agent: its mean is added to what every learner minimises. None: it has none."""
+    weighed: Weighed | None = None
+    """None for a kind without attention."""
 
 
 class Communication(eqx.Module):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, Weighed, received
 from gacrl.networks.graph import attend, attend_to_speakers, sighted, sighted_size
 from gacrl.networks.layers import Linear, Mlp, rectified
 from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
@@ -69,6 +69,8 @@ class Symbols(Communication):
     ) -> Spoken:
         known, said, entropy = [sighted(near.sight)], [], jnp.zeros(hidden.shape[0])
         squares = jnp.zeros(hidden.shape[0])
+        could_say: list[Array] = []
+        scores: list[Array] = []
         rounds = len(self.encode)
         if self.speaker_identity:
             known.append(near.who())
@@ -77,6 +79,7 @@ class Symbols(Communication):
         ):
             meant = hidden if code is None or number else code
             logits = encode(meant)
+            could_say.append(logits)
             squares += jnp.square(logits).mean(-1)
             log_symbol = jax.nn.log_softmax(logits)
             entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / rounds
@@ -89,11 +92,13 @@ class Symbols(Communication):
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
             heeded = edges_heard, jnp.where(near.adjacency, score, -jnp.inf)
             heard = attend_to_speakers(*heeded, words.sum(-1)) if self.gate else attend(*heeded)
+            scores.append(heeded[1])
             hidden = hidden + rectified(merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
         messages = jnp.stack(said)
         prices = [self.word_price * messages.sum((0, 2))] if self.word_price else []
         prices += [self.logit_price * squares] if self.logit_price else []
-        return Spoken(hidden, messages, (), entropy, sum(prices[1:], prices[0]) if prices else None)
+        price = sum(prices[1:], prices[0]) if prices else None
+        return Spoken(hidden, messages, (), entropy, price, Weighed(tuple(scores), tuple(could_say)))
 
     def spoke(
         self, meant: Float[Array, "N M"], number: int, key: PRNGKey | None, temperature: Float[Array, ""] | float

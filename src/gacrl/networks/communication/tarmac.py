@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, Weighed, received
 from gacrl.networks.graph import attend
 from gacrl.networks.layers import Linear
 from gacrl.types import PRNGKey
@@ -50,6 +50,7 @@ class Tarmac(Communication):
     ) -> Spoken:
         itself = jnp.ones((hidden.shape[0], 1), bool)
         listens, said = jnp.concatenate([near.adjacency, itself], axis=1), []
+        scores: list[Array] = []
         for number, (signature, value, query, merge) in enumerate(
             zip(self.signature, self.value, self.query, self.merge, strict=True)
         ):
@@ -59,6 +60,7 @@ class Tarmac(Communication):
             heard = jnp.concatenate([others, message[:, None]], axis=1)  # one's own words do not travel
             signatures, values = jnp.split(heard, [self.signature_size], axis=-1)
             score = jnp.einsum("nd,nkd->nk", query(hidden), signatures) / math.sqrt(self.signature_size)
-            context = attend(values, jnp.where(listens, score, -jnp.inf))
+            scores.append(jnp.where(listens, score, -jnp.inf))
+            context = attend(values, scores[-1])
             hidden = jnp.tanh(merge(jnp.concatenate([context, hidden], axis=-1)))
-        return Spoken(hidden, jnp.stack(said))
+        return Spoken(hidden, jnp.stack(said), weighed=Weighed(tuple(scores)))

@@ -1,16 +1,18 @@
 """How agents join `spread` and leave it while a policy is watched: a place for each, and masks for who is there."""
 
 from dataclasses import replace
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from gacrl.tasks.spread.environment import SpreadParams, SpreadState
 from gacrl.tasks.spread.settings import SpreadSettings
 from gacrl.tasks.task import Team
 
 MOST_AGENTS = 100
+Count: TypeAlias = int | Int[Array, ""]
 
 
 def least(settings: SpreadSettings) -> int:
@@ -34,10 +36,12 @@ def params(settings: SpreadSettings, numbers: SpreadParams, places: int, count: 
     )
 
 
-def join(settings: SpreadSettings, state: SpreadState, fresh: SpreadState, before: int, now: int) -> SpreadState:
+def join(
+    settings: SpreadSettings, state: SpreadState, fresh: SpreadState, before: Count, now: Count
+) -> SpreadState:
     """Put newcomers, and the landmarks that come with them, where a fresh start has them."""
 
-    def joined(old: Array, new: Array, first: int) -> Array:
+    def joined(old: Array, new: Array, first: Count) -> Array:
         index = np.arange(old.shape[0])
         return jnp.where(jnp.asarray((index >= first) & (index < now))[:, None], new, old)
 
