@@ -427,8 +427,6 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (README, r"`gacrl-112k` ends at a coverage of ([^,]*),", each("gacrl-112k-4-seeds", COVERED)),
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
-    (RESULTS, r"full graph comes to ([^:]*):", each("talk-colours-full-gamma-10-seeds", SOLVED)),
-    (RESULTS, r"ends at .02, comes to ([^(]*) \(", each("talk-colours-full-16-steps-10-seeds", SOLVED)),
     (RESULTS, r"512 episodes, success ([^,]*),", each("talk-traffic-easy-3-seeds", "success")),
     (RESULTS, r"1.0 .986 .996, return ([^(]*) \(", each("talk-traffic-easy-3-seeds", RETURN)),
     (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
@@ -460,7 +458,7 @@ def test_the_claims_are_counted_by_test():
 
 UNNOTED = {
     f"data/{name}.json"
-    for name in ("talk-colours-full-gamma-10-seeds", "talk-traffic-easy-3-seeds", "talk-scouts-study")
+    for name in ("talk-traffic-easy-3-seeds", "talk-scouts-study")
 }
 """Kept before a run had to know its commit; they say so, and docs/results.md beside their numbers."""
 
