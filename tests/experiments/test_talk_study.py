@@ -174,7 +174,7 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
     assert done.further["success 0.1"]["silent"].tolist() == held["further"]["success 0.1"]["silent"]
     assert done.answer.worth.point == pytest.approx(held["worth"][0])
     written = done.report.read_text(encoding="utf-8")
-    assert "10 seeds from 0, 320 episodes" in written and f"--known {KNOWN}" in written
+    assert "10 seeds from 0, 512 episodes" in written and f"--known {KNOWN}" in written
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ for number in range(10 * kills):
     child = os.fork()
     if child == 0:
         write_on(done)
-    time.sleep(chance.uniform(0, 4 * pace))
+    time.sleep(chance.uniform(0, 4 * pace * max(1.0, number / kills)))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     torn += any(folder.checkpoints.glob(".unfinished*"))

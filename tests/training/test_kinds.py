@@ -81,7 +81,7 @@ def test_one_update_moves_every_weight_that_agents_talk_with(name: str, kind: st
         return agent.communication
 
     if kind == "gated":  # so that listeners have a choice of speakers
-        open_ = tuple(eqx.tree_at(lambda gate: gate.bias, gate, gate.bias + 1.0) for gate in talk(learner).gate)
+        open_ = tuple(eqx.tree_at(lambda gate: gate.bias, gate, gate.bias + 3.0) for gate in talk(learner).gate)
         learner = eqx.tree_at(lambda learner: talk(learner).gate, learner, open_)
     after, metrics, experience = update(learner)
     assert all(np.isfinite(value).all() for value in jax.tree.leaves(metrics))
