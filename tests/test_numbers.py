@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import pytest
 
-from gacrl.evaluation.statistics import estimate, mean
+from gacrl.evaluation.statistics import estimate, mean, probability_of_improvement
 
 ROOT = Path(__file__).parent.parent
 README, RESULTS = "README.md", "docs/results.md"
@@ -233,6 +233,7 @@ def oracle(name: str) -> dict[int, Numbers]:
     return {2: beside(name, "oracle", COVERED), 3: beside(name, "oracle", RETURN)}
 
 
+EQUAL = {"gacrl": "gacrl-10-seeds", **{f"graph-{who}": f"graph-{who}-5-seeds" for who in ("vdn", "mappo", "ippo", "qmix")}}
 PARTS = [run["name"] for run in read("ablation/summary.json")["runs"]]
 ORACLES = {
     "N = 3, arena 1, 25 steps": "gacrl-10-seeds",
@@ -311,6 +312,14 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
     },
     (RESULTS, "What each part is worth", 0): {name: of_part(name) for name in PARTS},
+    (RESULTS, "Equal switches", 0): {
+        name: {column: interval(file, metric) for column, metric in enumerate((RETURN, COVERED, COVERED_2, ALL_COVERED), 1)}
+        for name, file in EQUAL.items()
+    },
+    (RESULTS, "Half the gradient steps", 0): {
+        "ten": {1: each("gacrl-112k-4-seeds", COVERED), 2: each("gacrl-112k-4-seeds", RETURN)},
+        "five": {1: each("gacrl-112k-half-4-seeds", COVERED), 2: each("gacrl-112k-half-4-seeds", RETURN)},
+    },
     (RESULTS, "The oracle", 0): {label: oracle(name) for label, name in ORACLES.items()},
 }  # fmt: skip
 
@@ -418,6 +427,11 @@ def test_a_number_without_a_file_is_found():
 FIRST = first_seen("gacrl-10-seeds", COVERED)
 
 
+def above_vdn(metric: str) -> Numbers:
+    """The probability that a seed of gacrl is above one of graph-vdn."""
+    return lambda: probability_of_improvement(seeds("gacrl-10-seeds", metric), seeds("graph-vdn-5-seeds", metric))
+
+
 def lost(metric: str) -> float:
     """By the first seed, silenced."""
     return seeds("gacrl-10-seeds", metric)[0] - seeds("silenced", metric)[0]
@@ -427,6 +441,8 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (README, r"`gacrl-112k` ends at a coverage of ([^,]*),", each("gacrl-112k-4-seeds", COVERED)),
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
+    (RESULTS, r"above one of `graph-vdn` with probability (.*) in the return", above_vdn(RETURN)),
+    (RESULTS, r"in the return and (.*) in coverage. VDN has", above_vdn(COVERED)),
     (RESULTS, r"512 episodes, success ([^,]*),", each("talk-traffic-easy-3-seeds", "success")),
     (RESULTS, r"1.0 .986 .996, return ([^(]*) \(", each("talk-traffic-easy-3-seeds", RETURN)),
     (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
