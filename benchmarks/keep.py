@@ -44,7 +44,7 @@ def main() -> int:
         print(f"keep: {error}", file=sys.stderr)
         return 2
     file = DATA / f"{asked.name}.json"
-    file.write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
+    file.write_text(json.dumps({**kept, **_places(kept)}, indent=2) + "\n", encoding="utf-8")
     print(file)
     return 0
 
@@ -57,6 +57,16 @@ def _kept(source: str, command: str, along: list[str]) -> dict[str, Any]:
         return kept_study(run, command)
     kept = kept_summary(run, command)
     return {**kept, "along": _along(run, along)} if along else kept
+
+
+def _places(kept: dict[str, Any]) -> dict[str, str]:
+    """Where a run or study was, as commands name it: folders of this machine are nobody else's."""
+    found = {key: Path(str(kept[key])) for key in ("run", "out", "report") if key in kept}
+    return {
+        key: str(Path("runs", *path.parts[-2 if key == "report" else -1 :]))
+        for key, path in found.items()
+        if path.is_absolute()
+    }
 
 
 def kept_summary(run: Path, command: str) -> dict[str, Any]:

@@ -118,3 +118,9 @@ def test_a_study_is_kept_with_the_one_commit_of_its_runs(
             keep.kept_study(tmp_path, "gacrl talk")
     else:
         assert keep.kept_study(tmp_path, "gacrl talk") == {"command": "gacrl talk", **summary}
+
+
+def test_folders_of_this_machine_are_not_kept(keep: ModuleType):
+    kept = {"out": "/tmp/x/talk", "report": "/tmp/x/talk/report.html", "task": "reference"}
+    assert keep._places(kept) == {"out": "runs/talk", "report": "runs/talk/report.html"}
+    assert keep._places({"run": "pretrained:gacrl"}) == {}
