@@ -20,6 +20,7 @@ from gacrl.config.run import CurriculumConfig, EvaluationConfig, RunConfig, Trai
 from gacrl.errors import ConfigError
 from gacrl.tasks.spread.settings import SpreadSettings
 from gacrl.tasks.task import Task
+from gacrl.training.recorder import RunFolder
 
 PAPER = preset("paper")
 UNUSUAL = RunConfig(
@@ -365,3 +366,12 @@ def test_gacrl_has_a_told_critic_where_something_must_be_said_and_a_file_may_say
     assert critic(from_dict({"env": {"name": "colours"}, "algorithm": {"critic": "sum"}})) == "sum"
     assert on_task(preset("qmix"), "reference").algorithm == preset("qmix").algorithm
     assert from_dict({"preset": "gacrl-talk", "env": {"name": "colours"}}) == on_task(preset("gacrl"), "colours")
+
+
+def test_a_run_without_a_setting_that_came_later_plays_as_it_was_trained(tmp_path: Path):
+    """A preset that has it since says nothing of that run; a file of settings is completed from its preset."""
+    written = to_dict(preset("gacrl"))
+    del written["algorithm"]["network"]["seen_slope"]
+    (tmp_path / "config.json").write_text(json.dumps(written), encoding="utf-8")
+    slopes = [config.algorithm.network.seen_slope for config in (RunFolder(tmp_path).config(), from_dict(written))]  # pyright: ignore
+    assert slopes == [0.0, 0.1]

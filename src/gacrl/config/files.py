@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from gacrl import tasks
 from gacrl.config import presets
@@ -85,13 +85,14 @@ def on_task(config: RunConfig, name: str) -> RunConfig:
     network = getattr(config.algorithm, "network", None)
     if network is not None and task.needs_memory:
         on = replace(on, algorithm=replace(on.algorithm, network=replace(network, recurrent=True)))
-    return with_told_critic(on) if task.needs_talk else on
+    return with_critic(on, "told") if task.needs_talk else on
 
 
-def with_told_critic(config: RunConfig) -> RunConfig:
-    """Return the settings with a critic that is told what others see, where it is a central one."""
-    central = getattr(config.algorithm, "critic", None) == "central"
-    return replace(config, algorithm=replace(config.algorithm, critic="told")) if central else config
+def with_critic(config: RunConfig, critic: Literal["told", "central"]) -> RunConfig:
+    """Return the settings with a critic that is told what others see, or a central one, where it is one of the two."""
+    if getattr(config.algorithm, "critic", None) not in ("told", "central"):
+        return config
+    return replace(config, algorithm=replace(config.algorithm, critic=critic))
 
 
 def changed(settings: Any, changes: Mapping[str, Any]) -> Any:

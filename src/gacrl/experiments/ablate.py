@@ -33,7 +33,7 @@ from gacrl.experiments.study import (
     refuse_other_settings,
     train_missing,
 )
-from gacrl.experiments.talking.kinds import num_parameters, with_central_critic
+from gacrl.experiments.talking.kinds import num_parameters
 from gacrl.experiments.worth import CLAIMED_FROM, remarkable, worths
 from gacrl.replacing import replace_json
 from gacrl.report import figures
@@ -149,7 +149,7 @@ def plan(config: RunConfig, out: Path, parts: Sequence[str]) -> list[Planned]:
     runs = [Planned(FULL, config, out / "all-parts")]
     for name in parts:
         changes = dict(known[name].changes)
-        config_of_part = with_central_critic(config) if name == NO_MESSAGES else config
+        config_of_part = configuration.with_critic(config, "central") if name == NO_MESSAGES else config
         if "network" in changes.get("algorithm", {}):
             network = {**changes["algorithm"]["network"], "parameters": wanted}
             changes["algorithm"] = {**changes["algorithm"], "network": network}

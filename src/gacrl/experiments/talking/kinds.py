@@ -78,7 +78,7 @@ def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunC
         "training": {"env_steps": env_steps},
         "evaluation": {"interval": max(interval, 1)},
     }
-    return configuration.with_told_critic(configuration.from_dict(changes, config))
+    return configuration.with_critic(configuration.from_dict(changes, config), "told")
 
 
 def num_parameters(config: RunConfig) -> int:
@@ -115,13 +115,7 @@ def hears_by(communication: str, talking: RunConfig, parameters: int) -> RunConf
     if kind.heard_late:
         changed = in_windows(changed)
     untaught = communication in (NONE, TOLD) or kind.heard_late
-    return with_central_critic(changed) if untaught else changed
-
-
-def with_central_critic(config: RunConfig) -> RunConfig:
-    """Return the settings with a critic that is not told, where there is one that is."""
-    told = getattr(config.algorithm, "critic", None) == "told"
-    return configuration.from_dict({"algorithm": {"critic": "central"}}, config) if told else config
+    return configuration.with_critic(changed, "central") if untaught else changed
 
 
 def in_windows(config: RunConfig) -> RunConfig:
