@@ -104,7 +104,9 @@ def talk(words: Words) -> int:
 
     prepare_jax(max(asked.seeds, 1))
     from gacrl.experiments import talk
+    from gacrl.experiments.talking.kinds import CLOSING_EPISODES
 
+    config = replace(config, evaluation=replace(config.evaluation, final_episodes=CLOSING_EPISODES))
     out = asked.out or Path("runs") / f"talk-{words.task}"
     env_steps = talk.ENV_STEPS if asked.env_steps is None else asked.env_steps
 

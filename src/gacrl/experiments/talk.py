@@ -37,7 +37,7 @@ from gacrl.experiments.study import (
     train_missing,
 )
 from gacrl.experiments.talking.cells import CAUGHT
-from gacrl.experiments.talking.kinds import CLOSING_EPISODES, hears_by, num_parameters, talker
+from gacrl.experiments.talking.kinds import hears_by, num_parameters, talker
 from gacrl.experiments.talking.known import Known, read
 from gacrl.messages import interventions
 from gacrl.replacing import replace_json
@@ -175,7 +175,6 @@ def talk(
     watch = watch or Watch()
     if seeds < 2:
         raise UserError(f"--seeds must be at least 2, not {seeds}: with one there is no interval over seeds")
-    config = replace(config, evaluation=replace(config.evaluation, final_episodes=CLOSING_EPISODES))
     config = talker(config, seeds, env_steps, env_steps // EVALUATIONS)
     before = None if known is None else read(known, config)
     runs = [run for run in plan(config, out) if before is None or run.name not in before.finals]

@@ -6,7 +6,7 @@ as seeds are. Results are kept as they come: a stopped sweep goes on with the me
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -294,30 +294,37 @@ def _hyper(trainer: AbstractTrainer, point: Point) -> Any:
 def _read(out: Path) -> Scores:
     """The results so far; a line that a crash cut off, or that is no result, is left out and trained again."""
     scores: Scores = {}
-    path = out / _RESULTS
-    for line in path.read_bytes().splitlines() if path.is_file() else []:
+    for row in _rows(out):
         try:
-            row = json.loads(line)
             point = Point(row["learning_rate"], row["epsilon"], row["temperature"])
             score = -math.inf if row[SCORE] is None else float(row[SCORE])
             if score < math.inf:
                 scores[Member(point, row["seed"])] = score
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError):
             continue
     return scores
 
 
 def _made_by(out: Path) -> list[Versions]:
-    """The versions that trained what is in the folder, each once; older lines do not say theirs."""
+    """Return the versions that trained what is in the folder, each once; older lines do not say theirs."""
     found: list[Versions] = []
-    for line in (out / _RESULTS).read_bytes().splitlines():
-        try:
-            made = json.loads(line).get("versions")
-        except (ValueError, AttributeError, RecursionError):
-            continue
+    for row in _rows(out):
+        made = row.get("versions")
         if made and made not in found:
             found.append(made)
     return found
+
+
+def _rows(out: Path) -> Iterator[dict[str, Any]]:
+    """The lines of results; not those that are no objects."""
+    path = out / _RESULTS
+    for line in path.read_bytes().splitlines() if path.is_file() else []:
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(row, dict):
+            yield row
 
 
 def _row(member: Member, score: float) -> dict[str, Any]:
