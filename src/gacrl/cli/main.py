@@ -4,6 +4,7 @@ Nothing heavy is imported before a command is known: `gacrl --help` answers at o
 """
 
 import contextlib
+import gc
 import json
 import os
 import sys
@@ -51,6 +52,9 @@ usage: gacrl COMMAND [OPTIONS]
   gacrl render oracle --out oracle.gif
 """
 
+_GARBAGE = (50_000, 20, 50)
+"""How seldom Python looks for cycles: while programs were traced, that was a twelfth of a short training's time."""
+
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0, 2 for a user's mistake, 130 after Ctrl-C (143 after SIGTERM).
@@ -60,6 +64,7 @@ def main(words: Sequence[str] | None = None) -> int:
     stopwatch.begin(with_process=words is None)
     if words is None:
         output.prepare()
+        gc.set_threshold(*_GARBAGE)
     words = list(map(_at_home, sys.argv[1:] if words is None else words))
     try:
         try:
