@@ -3,16 +3,18 @@
     python benchmarks/guard.py [--rounds 5] [--core 0] [--write]
     python benchmarks/guard.py --short                  # counts alone: a few seconds, for CI
 
-Fails where a ratio to a peer has fallen by more than 15 %, or a compiled program has grown by as much: in instructions,
-or in messages between devices; or where the training program of a preset, as it is handed to the compiler, has grown by
-more than 2 % (`lowered.py` shows where). Absolute times are never compared. Counts hold for one version of JAX: with
-another they are printed and not judged.
+Fails where a ratio to a peer has fallen by more than 15 %, or so has the part of an update that its matrix products
+take alone (IPPO and QMIX at JaxMARL's shapes); where a compiled program has grown by as much: in instructions, or in
+messages between devices; or where the training program of a preset, as it is handed to the compiler, has grown by more
+than 2 % (`lowered.py` shows where). Absolute times are never compared. Counts hold for one version of JAX: with another
+they are printed and not judged.
 --write makes what was measured the new baseline.
 """
 
 import argparse
 import json
 import statistics
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -67,6 +69,18 @@ def counted() -> dict[str, int]:
     return found | {f"{lowered.LOWERED}{preset}": lowered.count(preset) for preset in PRESETS}
 
 
+def shares(rounds: int, core: int) -> dict[str, dict[str, list[float]]]:
+    """The part of an update at JaxMARL's networks, batches and epochs that its products take alone, by preset."""
+    script = Path(__file__).with_name("arithmetic.py")
+    words = ["--preset", "ippo", "--preset", "qmix", "--shapes", "jaxmarl", "--core", str(core), "--json"]
+    found: dict[str, list[float]] = {}
+    for _ in range(rounds):
+        done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
+        for preset, seen in json.loads(done.stdout.splitlines()[-1]).items():
+            found.setdefault(preset, []).append(seen["own"] / seen["milliseconds"])
+    return {"products": found}
+
+
 def fallen(
     name: str, now: Mapping[str, Mapping[str, Sequence[float]]], before: Mapping[str, Mapping[str, float]]
 ) -> list[str]:
@@ -86,6 +100,14 @@ def fallen(
             print(f"{label:40} {peers.spread(values):32} baseline {was or 'none'}{'  FALLEN' * bad}")
             found += [label] * bad
     return found
+
+
+def rounded(ratios: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
+    """The medians, in three digits."""
+    return {
+        peer: {size: float(f"{statistics.median(values):.3g}") for size, values in sizes.items()}
+        for peer, sizes in ratios.items()
+    }
 
 
 def grown(now: Mapping[str, int], before: Mapping[str, int]) -> list[str]:
@@ -119,11 +141,9 @@ def main() -> None:
     if not asked.short:
         ratios = environment.compare(asked.rounds, asked.core)
         bad += fallen("environment", ratios, baseline.get("environment", {}))
-        medians = peers.summary(ratios)["ratio"]
-        rounded = {
-            peer: {size: float(f"{ratio:.3g}") for size, ratio in sizes.items()} for peer, sizes in medians.items()
-        }
-        measured = {"environment": rounded}
+        parts = shares(asked.rounds, asked.core)
+        bad += fallen("training", parts, baseline.get("training", {}))
+        measured = {"environment": rounded(ratios), "training": rounded(parts)}
     missing = [label for label in bad if label.endswith("(not measured)")]
     if asked.write and missing:
         sys.exit(f"{BASELINE.name} stays as it was: {'; '.join(missing)}")

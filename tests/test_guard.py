@@ -40,6 +40,7 @@ def test_a_program_that_grew_by_more_than_the_tolerance_is_named(guard):
 
 def test_the_committed_baseline_is_what_the_guard_reads(guard):
     baseline = guard.json.loads(guard.BASELINE.read_text(encoding="utf-8"))
-    assert set(baseline) == {"jax", "counts", "environment"}
+    assert set(baseline) == {"jax", "counts", "environment", "training"}
+    assert set(baseline["training"]["products"]) == {"ippo", "qmix"}
     assert set(baseline["environment"]) == {"jaxmarl", "vmas"}
     assert all(set(sizes) == {"1", "32", "1024", "16384"} for sizes in baseline["environment"].values())

@@ -1,7 +1,10 @@
 """How JAX is set up: quickly compiled but for training, and only where the user has not chosen."""
 
 import errno
+import json
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -54,3 +57,20 @@ def test_a_cache_that_cannot_be_written_is_left_out_and_said(tmp_path: Path, mon
 
 def full_disk(dir: Path):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.soak
+def test_two_trainings_at_once_share_an_empty_cache(tmp_path: Path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    words = [sys.executable, "-m", "gacrl", "train", "--preset", "qmix", "--env-steps", "3000"]
+    runs = [
+        subprocess.Popen(
+            [*words, "--out", str(tmp_path / name)], env=environment, stderr=subprocess.PIPE, text=True
+        )
+        for name in "ab"
+    ]
+    said = [run.communicate()[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0], said
+    finals = [json.loads((tmp_path / name / "summary.json").read_text())["final"] for name in "ab"]
+    assert finals[0] == finals[1]
+    assert any((tmp_path / "cache" / "gacrl" / "jax").iterdir())
