@@ -209,4 +209,4 @@ def collect(
             carry,
             jax.random.split(key, num_steps),
         )
-    return after, Rollout(transitions, carry.memory, after.memory)
+    return after, Rollout(transitions, carry.memory)

@@ -113,11 +113,10 @@ class Transition(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """T steps of E environments, and the policy's memory before and after them."""
+    """T steps of E environments, and the policy's memory before them."""
 
     transitions: Transition
     first_memory: Memory
-    last_memory: Memory
 
 
 Policy: TypeAlias = Callable[[Memory, Observation, PRNGKey], tuple[Decision, Memory]]

@@ -515,7 +515,7 @@ def updates():
                 next_observation=observe(t + 1),
                 info={"coverage_theta": jnp.float32(coverage)},
             )
-            rollout = Rollout(jax.tree.map(lambda leaf: leaf[None, None], step), (), ())
+            rollout = Rollout(jax.tree.map(lambda leaf: leaf[None, None], step), ())
             learner, metrics = update(learner, rollout, jax.random.key(t))
             jax.effects_barrier()
             result.learners.append(learner)
@@ -613,7 +613,7 @@ def test_other_tasks_are_explored_by_their_own_progress(monkeypatch, progress, m
         next_observation=observe(),
         info={name: jnp.float32(value) for name, value in measured.items()},
     )
-    rollout = Rollout(jax.tree.map(lambda leaf: leaf[None, None], step), (), ())
+    rollout = Rollout(jax.tree.map(lambda leaf: leaf[None, None], step), ())
     learner, metrics = update(fixed_learner(), rollout, jax.random.key(0))
     np.testing.assert_allclose(metrics["epsilon"], 0.5, rtol=1e-6)
     _, metrics = update(learner, rollout, jax.random.key(1))
@@ -650,7 +650,7 @@ def test_environments_side_by_side_share_one_coverage(monkeypatch):
         next_observation=observation,
         info={"coverage_theta": jnp.array([[1 / 3, 2 / 3], [0.0, 2 / 3]])},
     )
-    after, metrics = jax.jit(ALGORITHM.update)(learner, Rollout(steps, (), ()), jax.random.key(0))
+    after, metrics = jax.jit(ALGORITHM.update)(learner, Rollout(steps, ()), jax.random.key(0))
     np.testing.assert_array_equal(jax.vmap(UNPACK)(after.replay.items).reward, [1, 2, 3, 4, 0, 0, 0, 0, 0])
     assert int(after.optimizer.count) == 4
     assert metrics["loss"] == 2.5
@@ -672,7 +672,7 @@ def test_curriculum_moves_once_an_episode():
     def advance(state, done):
         done = jnp.asarray(done)
         transitions = SimpleNamespace(terminated=done & False, truncated=done)
-        return advancing.advance(state, jnp.int32(0), Rollout(transitions, (), ()))
+        return advancing.advance(state, jnp.int32(0), Rollout(transitions, ()))
 
     def levels(params):
         return float(params.local_ratio), float(params.coverage_threshold)
@@ -695,5 +695,5 @@ def test_no_curriculum_leaves_the_task_alone():
     params = ENV.default_params()
     still = curriculum.make(CurriculumConfig(), TASK, ENV, params)
     done = jnp.ones((1, 1), bool)
-    rollout = Rollout(SimpleNamespace(terminated=done, truncated=done), (), ())
+    rollout = Rollout(SimpleNamespace(terminated=done, truncated=done), ())
     assert still.advance(still.init(params)[0], jnp.int32(9), rollout)[1] is params

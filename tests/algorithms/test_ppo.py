@@ -230,7 +230,6 @@ def by_hand(num_agents: int = 2) -> Rollout:
             info={},
         ),
         (),
-        (),
     )
 
 

@@ -111,7 +111,6 @@ def hand_made(steps: int, case: Case) -> Rollout:
             left=jnp.asarray((end == 2)[..., None] & (np.arange(N) == 0)) if case.lives else None,
         ),
         (),
-        (),
     )
 
 

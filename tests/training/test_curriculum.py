@@ -28,7 +28,7 @@ def over(covered: list[float], going_on: int = 1) -> Rollout:
     """A step of several environments, in some of which an episode ends with this much covered."""
     done = jnp.array([[True] * len(covered) + [False] * going_on])
     info = {TASK.progress: jnp.array([covered + [1.0] * going_on])}
-    return Rollout(SimpleNamespace(terminated=done & False, truncated=done, info=info), (), ())
+    return Rollout(SimpleNamespace(terminated=done & False, truncated=done, info=info), ())
 
 
 def test_a_gate_counts_only_the_episodes_that_follow_success():

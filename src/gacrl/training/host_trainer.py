@@ -136,7 +136,7 @@ class HostTrainer(AbstractTrainer):
         decided, decisions = jax.tree.map(lambda *rows: jnp.stack(rows), *played.steps)
         carry = rollout.forgetting(self.memory, played.end, played.left)
         transitions = rollout.happened(decided, decisions, played.after)
-        experience = Rollout(transitions, state.carry.memory, carry.memory)
+        experience = Rollout(transitions, state.carry.memory)
         return self.learn(state, carry, experience, update_key, key)
 
     def _beginning(self, state: TrainState) -> TrainState:
