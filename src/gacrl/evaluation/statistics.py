@@ -110,15 +110,6 @@ def median(values: Numbers) -> Any:
     return np.median(scores.mean(-2), axis=-1)
 
 
-def optimality_gap(values: Numbers, optimum: float = 1.0) -> Any:
-    """Return the mean shortfall from the optimum; scores beyond it count as reaching it. [S] or [..., S, K] to [...].
-
-    Raises as `iqm` does.
-    """
-    _require_finite(optimum, "the optimum of an optimality gap")
-    return optimum - np.minimum(_some(values), optimum).mean((-2, -1))
-
-
 def estimate(values: Numbers, statistic: Statistic = iqm, reps: int = 2000, seed: int = 0) -> Estimate:
     """Return a statistic of scores [S] or [S, K] with its 95 % stratified-bootstrap interval.
 
@@ -140,15 +131,6 @@ def difference(a: Numbers, b: Numbers, statistic: Statistic = iqm, reps: int = 2
     low, high = _interval(resampled)
     verdict: Verdict = "higher" if low > 0 else "lower" if high < 0 else "cannot be told apart"
     return Difference(float(statistic(first) - statistic(second)), low, high, _detectable(first, second), verdict)
-
-
-def detectable(a: Numbers, b: Numbers) -> float:
-    """Return the smallest difference of means that a two-sided t-test at 5 % sees with 80 % power (Cohen 1988, ch. 2).
-
-    The spread is pooled over both, within tasks. Scores as for `difference`. An IQM of scores that are about
-    normal spreads some 10 % wider than their mean: for it, read this as a lower bound.
-    """
-    return _detectable(*_checked_pair(a, b))
 
 
 def probability_of_improvement(a: Numbers, b: Numbers, reps: int = 2000, seed: int = 0) -> Estimate:
@@ -306,6 +288,11 @@ def _improvement(first: Floats, second: Floats) -> Any:
 
 
 def _detectable(first: Floats, second: Floats) -> float:
+    """The smallest difference of means that a two-sided t-test at 5 % sees with 80 % power (Cohen 1988, ch. 2).
+
+    The spread is pooled over both, within tasks. An IQM of scores that are about normal spreads some 10 % wider than
+    their mean: for it, read this as a lower bound.
+    """
     tasks = first.shape[1]
     sizes = len(first), len(second)
     degrees = sizes[0] + sizes[1] - 2
