@@ -23,7 +23,6 @@ from gacrl.evaluation import statistics
 from gacrl.evaluation.statistics import with_interval
 from gacrl.experiments.compare.compare import Comparison, Pair, compare
 from gacrl.experiments.compare.data import to_dict, to_marl_eval
-from gacrl.experiments.compare.marl_eval import from_marl_eval
 from gacrl.experiments.compare.pages import write_page
 
 REFERENCES = {
@@ -322,7 +321,8 @@ def test_a_run_that_diverged_says_so_beside_the_others(
     assert ">diverged<" in (out / "comparison-figures" / "return_agent_mean-dots.svg").read_text(encoding="utf-8")
     rows = [line.split(",") for line in table.read_text().splitlines()]
     assert [str(lost), "wild", "4", "2000", "diverged", "return_agent_mean", "nan"] in rows
-    assert len(from_marl_eval(to_marl_eval(compare([Path(word) for word in words[1:3]])))) == 5
+    seeds = to_marl_eval(compare([Path(word) for word in words[1:3]]))["spread"]["3_agents_25_steps"]
+    assert {name: len(runs) for name, runs in seeds.items()} == {"calm": 5}
 
 
 def test_a_group_that_lost_seeds_says_so_and_is_not_claimed_to_be_better(make_run: MakeRun):
@@ -376,12 +376,17 @@ def test_a_line_that_a_crash_cut_off_is_dropped_with_a_warning(
 
 def test_marl_eval_has_every_seed(make_run: MakeRun):
     found = compare([make_run("a", VDN, HIGH), make_run("b", MAPPO, LOW[:2])])
-    runs = from_marl_eval(to_marl_eval(found))
-    assert [(run.algorithm, run.run) for run in runs[4:6]] == [("a", "seed_4"), ("b", "seed_0")]
-    assert {(run.environment, run.task) for run in runs} == {("spread", "3_agents_25_steps")}
-    assert runs[0].env_steps == list(EVALUATED_AT)
-    assert runs[0].metrics["return_agent_mean"] == [[-10.0], [-9.0], [-8.0]]
-    assert runs[0].absolute["return_agent_mean"] == [-8.0]
+    data = to_marl_eval(found)
+    assert list(data) == ["spread"] and list(data["spread"]) == ["3_agents_25_steps"]
+    runs = data["spread"]["3_agents_25_steps"]
+    assert {name: list(seeds) for name, seeds in runs.items()} == {
+        "a": [f"seed_{k}" for k in range(5)],
+        "b": ["seed_0", "seed_1"],
+    }
+    *steps, closing = runs["a"]["seed_0"].values()
+    assert [step["step_count"] for step in steps] == list(EVALUATED_AT)
+    assert [step["return_agent_mean"] for step in steps] == [[-10.0], [-9.0], [-8.0]]
+    assert closing["return_agent_mean"] == [-8.0]
 
 
 # The command.
@@ -416,7 +421,8 @@ def test_the_command_prints_and_writes_everything(
         for metric in ("return_agent_mean", "coverage_final_0-1")
         for kind in ("curves", "dots", "profile")
     }
-    assert len(from_marl_eval(json.loads(marl.read_text()))) == 11
+    (runs,) = json.loads(marl.read_text())["spread"].values()
+    assert {name: len(seeds) for name, seeds in runs.items()} == {"a + c": 6, "b": 5}
 
     assert main(words) == 2
     assert f"{out / 'comparison.html'} exists" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""marl-eval's raw data (Gorsane et al. 2022): written, and read back."""
+"""marl-eval's raw data (Gorsane et al. 2022), written from runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,38 +44,3 @@ def to_marl_eval(runs: Sequence[EvaluatedRun]) -> dict[str, Any]:
         absolute = {name: [float(value) for value in values] for name, values in run.absolute.items()}
         algorithm[run.run] = {**steps, "absolute_metrics": absolute}
     return data
-
-
-def from_marl_eval(data: Mapping[str, Any]) -> list[EvaluatedRun]:
-    """Return the runs of marl-eval's raw data, evaluations in the order of their step counts.
-
-    Raises UserError where it is not of that form.
-    """
-    try:
-        return [
-            _read_run(environment, task, algorithm, run, content)
-            for environment, tasks in data.items()
-            for task, algorithms in tasks.items()
-            for algorithm, named_runs in algorithms.items()
-            for run, content in named_runs.items()
-        ]
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            "this is not marl-eval's raw data, which nests environment, task, algorithm, run and evaluation "
-            f"with a step_count: {type(error).__name__} {error}"
-        ) from error
-
-
-def _read_run(environment: str, task: str, algorithm: str, run: str, content: Mapping[str, Any]) -> EvaluatedRun:
-    evaluations = [dict(step) for name, step in content.items() if name != "absolute_metrics"]
-    evaluations.sort(key=lambda step: step["step_count"])
-    names = [name for name in (evaluations[0] if evaluations else {}) if isinstance(evaluations[0][name], list)]
-    return EvaluatedRun(
-        environment,
-        task,
-        algorithm,
-        run,
-        [int(step["step_count"]) for step in evaluations],
-        {name: [[float(value) for value in step[name]] for step in evaluations] for name in names},
-        {name: [float(value) for value in values] for name, values in content.get("absolute_metrics", {}).items()},
-    )
