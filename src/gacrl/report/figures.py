@@ -242,7 +242,6 @@ def dots(
 def profile(
     profiles: Mapping[str, tuple[Numbers, Numbers, Numbers | None, Numbers | None]],
     xlabel: str,
-    ylabel: str = "share of seeds above",
     styles: Mapping[str, Look] | None = None,
 ) -> str:
     """Performance profiles: for each name thresholds [P], the share of runs above them [P] and its bounds; SVG.
@@ -265,7 +264,7 @@ def profile(
                 axes.fill_between(x, np.asarray(low, float), np.asarray(high, float), **band)
             axes.step(x, share, linestyle=dash, where="post", color=color, linewidth=2)
         axes.set_ylim(-0.03, 1.03)
-        _say(axes, xlabel, ylabel)
+        _say(axes, xlabel, "share of seeds above")
         means = {name: float(np.mean(np.asarray(share))) for name, (_, share, _, _) in profiles.items()}
         beside(axes, [Label(name, means[name], {**_style(styles[name]), "marker": None}, False) for name in means])
     return out.getvalue()

@@ -207,7 +207,7 @@ def examine(own: Own) -> None:
     _check_step(task, env, after)
     _check_same(task.name, "state", state, after_state)
     _check_same(task.name, "observation", seen, after.observation)
-    _check_records(task, own.settings, env, state, params, after)
+    _check_records(task, own.settings, env, state, params)
 
 
 def _require(condition: bool, sentence: str) -> None:
@@ -310,7 +310,7 @@ def _check_same(task: str, what: str, first: Any, later: Any) -> None:
         )
 
 
-def _check_records(task: Task, settings: Any, env: Environment, state: Any, params: Any, after: TimeStep) -> None:
+def _check_records(task: Task, settings: Any, env: Environment, state: Any, params: Any) -> None:
     """What the record says besides: its scene, its difficulty."""
     if task.scene is not None:
         seen = jax.eval_shape(lambda state, params: task.scene(settings, state, params), state, params)  # pyright: ignore[reportOptionalCall]

@@ -111,7 +111,7 @@ class Lane:
         if now != count:
             places, stood = self._resized(stood, places, count, now, t)
         room, params = player.room(places), player.params(places, now)
-        hand = _hand(here, places, now, room, stood)
+        hand = _hand(here, places, now, room.marks)
         if hand is not None:
             stood = room.edited(params, stood, hand)
         meddling, rules = None, standing(scene, t)
@@ -251,12 +251,11 @@ def untouched(scene: Scene) -> tuple[Event, ...]:
     return tuple(event for event in scene.events if event.kind not in _MEDDLING)
 
 
-def _hand(here: Sequence[Event], places: int, count: int, room: AnyRoom, stood: Stood) -> Edit | None:
+def _hand(here: Sequence[Event], places: int, count: int, marks: int) -> Edit | None:
     """Return what a hand moves in a step, the last place of each thing; None where it moves nothing."""
     moves = [event for event in here if event.kind == "move"]
     if not moves:
         return None
-    marks = room.marks
     groups = {
         "agent": Placed(np.zeros((places, 2), np.float32), np.zeros(places, bool)),
         "mark": Placed(np.zeros((marks, 2), np.float32), np.zeros(marks, bool)),

@@ -138,10 +138,10 @@ def measured(weights: Mapping[str, float], metrics: Metrics) -> Float[np.ndarray
     return np.sum([weight * metrics[name] for name, weight in weights.items()], axis=0)
 
 
-def blocks(episodes: Float[np.ndarray, " E"], size: int = FINAL_EPISODES) -> Float[np.ndarray, " blocks"]:
+def blocks(episodes: Float[np.ndarray, " E"]) -> Float[np.ndarray, " blocks"]:
     """Return means of blocks of episodes; at least two blocks, however few episodes there are."""
-    count = max(len(episodes) // size, 2)
-    size = min(size, len(episodes) // count)
+    count = max(len(episodes) // FINAL_EPISODES, 2)
+    size = min(FINAL_EPISODES, len(episodes) // count)
     return episodes[: count * size].reshape(count, size).mean(1)
 
 
