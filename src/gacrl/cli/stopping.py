@@ -6,11 +6,11 @@ from collections.abc import Generator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gacrl.cli.terminal import RunsWatcher, TerminalWatcher
+    from gacrl.cli.terminal import LiveWatcher
 
 
 @contextlib.contextmanager
-def stopping(terminal: "TerminalWatcher | RunsWatcher") -> Generator[None]:
+def stopping(terminal: "LiveWatcher") -> Generator[None]:
     """Let the first SIGINT or SIGTERM ask for a stop at the next checkpoint; the next one is not ours."""
 
     def handler(number: int, frame: Any) -> None:

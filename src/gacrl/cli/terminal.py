@@ -3,9 +3,10 @@
 import math
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.live import Live
@@ -30,8 +31,11 @@ if TYPE_CHECKING:
     from gacrl.doctor import Check, Finding
 
 
-class TerminalWatcher:
-    """Follows a run. On a terminal the line lives, also while things compile; elsewhere it is a line each.
+Watching = TypeVar("Watching", bound="LiveWatcher")
+
+
+class LiveWatcher(ABC):
+    """Has a line that lives on a terminal as long as it is entered, and hands on that somebody asks for a stop.
 
     quiet: say nothing; another process does.
     """
@@ -46,7 +50,7 @@ class TerminalWatcher:
         self.exit_code = 130
         """What an early stop returns to the shell."""
 
-    def __enter__(self) -> "TerminalWatcher":
+    def __enter__(self: Watching) -> Watching:
         return self
 
     def __exit__(
@@ -55,17 +59,28 @@ class TerminalWatcher:
         self._live.stop()
 
     def request_stop(self, exit_code: int) -> None:
-        """End the run at the next checkpoint."""
+        """End the run under way at its next checkpoint, and begin no other."""
         self._stop, self.exit_code = True, exit_code
-        self._say("stopping after the evaluation under way; once more to stop at once")
+        self.say("stopping after the evaluation under way; once more to stop at once")
+
+    @abstractmethod
+    def say(self, sentence: str) -> None:
+        """Show what goes on."""
+
+    def _print(self, line: str) -> None:
+        say(self._console, line)
+
+
+class TerminalWatcher(LiveWatcher):
+    """Follows a run. On a terminal the line lives, also while things compile; elsewhere it is a line each."""
 
     def watcher(self) -> Watcher:
         """Return the functions that a session calls."""
         return Watcher(
             planned=self._planned,
-            compiling=lambda: self._say("compiling the training program"),
+            compiling=lambda: self.say("compiling the training program"),
             progress=self._progress,
-            finishing=lambda: self._say("closing evaluation, episodes and GIF"),
+            finishing=lambda: self.say("closing evaluation, episodes and GIF"),
             warn=lambda sentence: print(f"gacrl: {sentence}", file=sys.stderr),
             stop=lambda: self._stop,
         )
@@ -91,14 +106,12 @@ class TerminalWatcher:
         if self._alive:
             self._live.start()
 
-    def _say(self, what: str) -> None:
+    def say(self, sentence: str) -> None:
+        """Show what goes on: on the live line where there is one."""
         if self._alive:
-            self._line.text = what
+            self._line.text = sentence
         else:
-            self._print(what)
-
-    def _print(self, line: str) -> None:
-        say(self._console, line)
+            self._print(sentence)
 
     def note(self, line: str) -> None:
         """Print a line that belongs to the run, from any thread."""
@@ -170,37 +183,18 @@ class TerminalWatcher:
             self._print(paper_tables.MEANING)
 
 
-class RunsWatcher:
+class RunsWatcher(LiveWatcher):
     """Follows several runs, one after the other: how far each is, which of how many it is, and how long all will take.
 
     Lines of one run that come soon after each other are left out. On a terminal a live line says more.
     """
 
     def __init__(self) -> None:
-        self._console = console()
-        self._alive = self._console.is_terminal
+        super().__init__()
         self._names: dict[str, str] = {}
         self._over: set[str] = set()
         self._seconds: list[float] = []
         self._printed = -math.inf
-        self._line = _Line()
-        self._live = Live(self._line, console=self._console, refresh_per_second=8, transient=True)
-        self._stop = False
-        self.exit_code = 130
-        """What an early stop returns to the shell."""
-
-    def __enter__(self) -> "RunsWatcher":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._live.stop()
-
-    def request_stop(self, exit_code: int) -> None:
-        """End the run under way at its next checkpoint, and begin no other."""
-        self._stop, self.exit_code = True, exit_code
-        self.say("stopping after the evaluation under way; once more to stop at once")
 
     def planned(self, runs: Mapping[str, str]) -> None:
         """Take note of the runs that are going to be made, and of what each is."""
@@ -263,9 +257,6 @@ class RunsWatcher:
         took = [*self._seconds, *under_way]
         waiting = max(len(self._names) - len(self._over) - len(under_way), 0)
         return f"all runs: {duration((of_this or 0.0) + waiting * sum(took) / len(took))} left"
-
-    def _print(self, line: str) -> None:
-        say(self._console, line)
 
 
 class _Line:
