@@ -11,15 +11,12 @@ import argparse
 import hashlib
 import json
 import shutil
-from dataclasses import replace
+import sys
 from pathlib import Path
 from typing import Any
 
-import jax
-
+from gacrl import play
 from gacrl.config import files
-from gacrl.training import build, checkpoint, session
-from gacrl.training.keeper import Acting
 
 SHIPPED = Path(__file__).parents[1] / "src" / "gacrl" / "pretrained"
 
@@ -38,19 +35,9 @@ def main() -> None:
 
 
 def _ship(run: Path, name: str, seed: int) -> None:
-    config = files.load(run / "config.json")
-    found, warnings = checkpoint.newest(run / "checkpoints")
-    assert not warnings, warnings
-    learners = session.load_learners(found, build.make_trainer(config))
-    at = config.seeds.index(seed)
-    learner = jax.tree.map(lambda leaf: leaf[at : at + 1], learners)
-    alone = replace(config, seed=seed, num_seeds=1)
-    folder = SHIPPED / name
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    (folder / "config.json").write_text(json.dumps(files.to_dict(alone), indent=2) + "\n", encoding="utf-8")
-    tensors = checkpoint.serialise(checkpoint.arrays(Acting(learner)))
-    print(checkpoint.save(folder / "checkpoints", tensors, found.env_steps, files.fingerprint(alone), {}))
+    member = files.load(run / "config.json").seeds.index(seed)
+    shutil.rmtree(SHIPPED / name, ignore_errors=True)
+    print(play.save_policy(f"{run}@{member}", SHIPPED / name, warn=sys.exit))  # a damaged checkpoint is not shipped
 
 
 def _write_card(folder: Path, summary: dict[str, Any], seed: int) -> None:

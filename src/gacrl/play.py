@@ -177,14 +177,14 @@ def pretrained() -> dict[str, Path]:
     return {path.name: path for path in sorted(folders) if path.is_dir() and not path.name.startswith("_")}
 
 
-def save_policy(run: str | Path, out: Path) -> Path:
+def save_policy(run: str | Path, out: Path, warn: Callable[[str], None] = lambda sentence: None) -> Path:
     """Write the policy of a run's member (its first, for a folder) as a run folder without what only learning needs.
 
     Raises UserError where `out` exists, or there is no such run.
     """
     if out.exists():
         raise UserError(f"{out} exists: choose another folder")
-    opened = open_one(run)
+    opened = open_one(run, warn=warn)
     config = replace(folder_of(run).config(), seed=opened.config.seed, num_seeds=1)
     out.mkdir(parents=True)
     (out / "config.json").write_text(configuration.dumps(config), encoding="utf-8")
