@@ -442,7 +442,7 @@ def lost(metric: str) -> float:
 
 
 SENTENCES: list[tuple[str, str, Numbers]] = [
-    (README, r"`gacrl-112k` ends at a coverage of ([^,]*),", each("gacrl-112k-4-seeds", COVERED)),
+    (README, r"Its four seeds end at a coverage of ([^;]*);", each("gacrl-112k-4-seeds", COVERED)),
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
     (
@@ -488,7 +488,7 @@ UNNOTED = {f"data/{name}.json" for name in ("talk-traffic-easy-3-seeds", "talk-s
 
 @pytest.mark.parametrize(
     "file",
-    ["reproduction/results.json", "ablation/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
+    ["reproduction/results.json", "ablation/summary.json", "grid/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
 )  # fmt: skip
 def test_every_file_names_the_one_clean_commit_that_made_it(file: str):
     versions = read(file)["versions"]
