@@ -462,7 +462,7 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"scrambled (−12[^]]*\])", of_study("scouts", "played", "scrambled")),
     (
         RESULTS,
-        r"last round is sent takes (\S*) bits",
+        r"the second one carries (\S*) of its",
         lambda: (data(IN_MPE2)["messages"]["bits_used_last_round"],),
     ),
 ]
