@@ -119,7 +119,7 @@ def of_study(task: str, *path: str, whole: bool = True) -> Numbers:
     """The mean over the seeds of a learner of a study of talk, with its interval or without."""
 
     def found() -> tuple[float, ...]:
-        values: Any = data("talk-beacon" if task == "beacon" else f"talk-{task}-study")
+        values: Any = data(f"talk-{task}-study")
         for word in path:
             values = values[word]
         return tuple(estimate(values, mean)) if whole else (float(np.mean(values)),)
@@ -457,7 +457,7 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"1.0 .986 .996, return ([^(]*) \(", each("talk-traffic-easy-3-seeds", RETURN)),
     (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
     (RESULTS, r"\(yielder ([^)]*)\)", beside("talk-traffic-easy-3-seeds", "yielder", "success", RETURN)),
-    (RESULTS, r"talk-beacon.json\)\): silent ([^]]*\])", of_study("beacon", "returns", "silent")),
+    (RESULTS, r"talk-beacon-study.json\)\): silent ([^]]*\])", of_study("beacon", "returns", "silent")),
     (RESULTS, r"the talking ones silenced ([^]]*\])", of_study("beacon", "played", "silenced")),
     (RESULTS, r"scrambled (1\.[^]]*\])", of_study("beacon", "played", "scrambled")),
     (RESULTS, r"scouts-study.json\)\), return: silent ([^]]*\])", of_study("scouts", "returns", "silent")),
