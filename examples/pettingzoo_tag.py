@@ -1,6 +1,6 @@
 """MPE2's simple_tag_v3: three pursuers learn to catch a prey, which runs by a script.
 
-gacrl train --env examples/pettingzoo_tag.py:tag --preset ippo --env-steps 200000
+gacrl train --env examples/pettingzoo_tag.py:tag --preset ippo --env-steps 100000
 """
 
 import numpy as np

@@ -442,7 +442,7 @@ def lost(metric: str) -> float:
 
 
 SENTENCES: list[tuple[str, str, Numbers]] = [
-    (README, r"`gacrl-112k` ends at a coverage of ([^,]*),", each("gacrl-112k-4-seeds", COVERED)),
+    (README, r"Its four seeds end at a coverage of ([^;]*);", each("gacrl-112k-4-seeds", COVERED)),
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
     (
@@ -457,12 +457,15 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"1.0 .986 .996, return ([^(]*) \(", each("talk-traffic-easy-3-seeds", RETURN)),
     (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
     (RESULTS, r"\(yielder ([^)]*)\)", beside("talk-traffic-easy-3-seeds", "yielder", "success", RETURN)),
+    (RESULTS, r"talk-beacon-study.json\)\): silent ([^]]*\])", of_study("beacon", "returns", "silent")),
+    (RESULTS, r"the talking ones silenced ([^]]*\])", of_study("beacon", "played", "silenced")),
+    (RESULTS, r"scrambled (1\.[^]]*\])", of_study("beacon", "played", "scrambled")),
     (RESULTS, r"scouts-study.json\)\), return: silent ([^]]*\])", of_study("scouts", "returns", "silent")),
     (RESULTS, r"told (−9[^]]*\])", of_study("scouts", "returns", "told")),
     (RESULTS, r"scrambled (−12[^]]*\])", of_study("scouts", "played", "scrambled")),
     (
         RESULTS,
-        r"last round is sent takes (\S*) bits",
+        r"the second one carries (\S*) of its",
         lambda: (data(IN_MPE2)["messages"]["bits_used_last_round"],),
     ),
 ]
@@ -488,7 +491,7 @@ UNNOTED = {f"data/{name}.json" for name in ("talk-traffic-easy-3-seeds", "talk-s
 
 @pytest.mark.parametrize(
     "file",
-    ["reproduction/results.json", "ablation/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
+    ["reproduction/results.json", "ablation/summary.json", "grid/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
 )  # fmt: skip
 def test_every_file_names_the_one_clean_commit_that_made_it(file: str):
     versions = read(file)["versions"]

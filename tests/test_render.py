@@ -368,6 +368,25 @@ def test_marks_are_counted_where_they_are_there_and_lit():
     assert (one_of_two != two_of_three).any()
 
 
+def test_agents_with_goals_are_counted_where_they_are_at_their_own():
+    """Two of one goal are two; another's mark is no goal; who has no colour seeks nothing."""
+
+    def counted(places: list[list[float]], colours: list[int]) -> tuple[str, str]:
+        episode = redrawn(
+            world(places, [[0.5, 0.5], [-0.5, -0.5]]),
+            agents={"colour": np.tile(colours, (4, 1))},
+            marks={"colour": np.tile([0, 1], (4, 1))},
+        )
+        picture = render.Picture(episode, 480)
+        return picture._counted, picture._counts[1]
+
+    at, beside = [0.5, 0.5], [-0.5, -0.5]
+    assert counted([at, at], [0, 0]) == ("agents at their place", "2 / 2")
+    assert counted([at, beside], [0, 0]) == ("agents at their place", "1 / 2")
+    assert counted([beside, at], [0, PLAIN]) == ("agents at their place", "0 / 1")
+    assert counted([at, at], [PLAIN, PLAIN])[0] == "places reached"
+
+
 def test_things_are_called_what_the_task_calls_them():
     """In title, captions and legend, and nowhere else; an agent and a mark of their own name."""
     episode = world([[0, 0], [0.5, 0.5]], [[0.5, -0.5]])

@@ -103,6 +103,7 @@ class Picture:
         self.episode, self._words, self._view = episode, words, episode.scene
         self._size, self._unit = size, size / 480
         self._return, self._symbols = episode.return_so_far, episode.symbols
+        self._counted, self._counts = self._counting()
 
         centre, reach = _view(self._view, *(() if other is None else (other,)))
         side = size * SUPERSAMPLING
@@ -137,11 +138,9 @@ class Picture:
         page.paste(self._scene(t), (0, self._header))
         draw, px = ImageDraw.Draw(page), self._px
         steps, y = self.episode.num_steps, self._footer
-        marks = self._view.marks
-        count = f"{(marks.lit & marks.there)[t].sum()} / {marks.there[t].sum()}"
         values = (
             f"{t} / {steps}",
-            count if marks.there.any() else "",
+            self._counts[t],
             f"{round(self._return[t], 1) + 0.0:.1f}".replace("-", "−"),  # never −0.0
         )
         for (x, anchor), value in zip(self._columns(), values, strict=True):
@@ -150,6 +149,24 @@ class Picture:
         if t:
             draw.rectangle((0, y, self._size * t / steps, y + px(3) - 1), RIM)
         return page
+
+    def _counting(self) -> tuple[str, list[str]]:
+        """What the footer counts, and how much at each step: agents at the mark of their own colour where they have it,
+        marks that are lit elsewhere, nothing where there are no marks.
+        """
+        agents, marks = self._view.agents, self._view.marks
+        seeking = agents.there & (agents.colour >= 0)
+        if not marks.there.any():
+            return "", [""] * len(marks.there)
+        if seeking.any():
+            own = (agents.colour[:, :, None] == marks.colour[:, None]) & marks.there[:, None]
+            offsets = agents.positions[:, :, None] - marks.positions[:, None]
+            found = seeking & (own & (np.linalg.norm(offsets, axis=-1) < marks.radius[:, None])).any(-1)
+            said, of = f"{self._words.agent}s at their {self._words.mark}", seeking
+        else:
+            found, of = marks.lit & marks.there, marks.there
+            said = f"{self._words.mark}s {self._words.lit}"
+        return said, [f"{some} / {all_of_them}" for some, all_of_them in zip(found.sum(1), of.sum(1), strict=True)]
 
     def _px(self, length: int) -> int:
         return round(length * self._unit)
@@ -171,7 +188,7 @@ class Picture:
             title = title.rstrip("…")[:-1] + "…"
         draw.text((px(16), px(19)), title, INK, bold, "lm")
         draw.text((self._size - px(16), px(19)), note, FAINT, small, "rm")
-        captions = ("step", f"{self._words.mark}s {self._words.lit}" if marks else "", "return so far")
+        captions = ("step", self._counted, "return so far")
         for (x, anchor), caption in zip(self._columns(), captions, strict=True):
             draw.text((x, self._footer + px(17)), caption, FAINT, small, anchor)
 

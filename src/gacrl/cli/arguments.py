@@ -292,7 +292,7 @@ class View:
       gacrl view told --env reference --port 0
     """
 
-    run: tyro.conf.Positional[tuple[str, ...]]
+    run: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN [OTHER]")]
     """One policy, or two."""
     sampled: bool = False
     """Explore as in training, instead of playing greedily."""
@@ -324,7 +324,7 @@ class Compare:
       gacrl compare runs/gacrl-1 --out report.html      everything about one run, on a page with its episodes
     """
 
-    run: tyro.conf.Positional[tuple[Path, ...]]
+    run: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN …")]
     """Run folders."""
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A metric of the closing evaluation; may be given several times. None: the first two of the task's tables."""
