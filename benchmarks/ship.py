@@ -37,7 +37,8 @@ def main() -> None:
 def _ship(run: Path, name: str, seed: int) -> None:
     member = files.load(run / "config.json").seeds.index(seed)
     shutil.rmtree(SHIPPED / name, ignore_errors=True)
-    print(play.save_policy(f"{run}@{member}", SHIPPED / name, warn=sys.exit))  # a damaged checkpoint is not shipped
+    # A warning, as of a damaged checkpoint, ends it.
+    print(play.save_policy(f"{run}@{member}", SHIPPED / name, warn=sys.exit))
 
 
 def _write_card(folder: Path, summary: dict[str, Any], seed: int) -> None:

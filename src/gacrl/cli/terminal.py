@@ -35,7 +35,7 @@ Watching = TypeVar("Watching", bound="LiveWatcher")
 
 
 class LiveWatcher(ABC):
-    """Has a line that lives on a terminal as long as it is entered, and hands on that somebody asks for a stop.
+    """Owns the live line of a terminal, and the stop that a user asks for.
 
     quiet: say nothing; another process does.
     """
