@@ -114,7 +114,7 @@ def run(words: list[str], python: str, checkout: str | None) -> Score:
     return json.loads(lines[-1])
 
 
-def versions(python: str, checkout: str | None) -> dict[str, str]:
+def versions_of_theirs(python: str, checkout: str | None) -> dict[str, str]:
     """What theirs is."""
     program = (
         "import json, importlib.metadata as m; print(json.dumps({n: m.version(n) for n in "
@@ -146,7 +146,13 @@ def main() -> None:
     python = asked.python or peers.python_of("benchmarl")
     if python is None:
         sys.exit("BenchMARL cannot be installed here")
-    found: dict[str, Any] = {"theirs": versions(python, asked.benchmarl)}
+    from gacrl.versions import versions
+
+    found: dict[str, Any] = {
+        "command": f"python benchmarks/equal_budget.py --steps {asked.steps} --seeds {asked.seeds}",
+        "versions": versions(),
+        "theirs": versions_of_theirs(python, asked.benchmarl),
+    }
     print(found["theirs"], flush=True)
     for algorithm in ALGORITHMS:
         for seed in range(100, 100 + asked.seeds):
