@@ -40,8 +40,6 @@ class AgentOutput(NamedTuple):
     hidden: Float[Array, "N H"]
     messages: Float[Array, "R N V"] | None
     adjacency: Bool[Array, "N N"]
-    entropy: Float[Array, " N"] | float
-    """Of the symbols sent, nats; 0 without symbols."""
     code_loss: Float[Array, " N"] | float
     """Negative evidence lower bound of the code, up to constants; 0 without a code."""
     message_loss: Float[Array, " N"] | None = None
@@ -150,7 +148,6 @@ class AgentNetwork(eqx.Module):
             hidden=hidden,
             messages=messages,
             adjacency=adjacency,
-            entropy=spoken.entropy,
             code_loss=seen.code_loss,
             message_loss=spoken.loss,
             weighed=spoken.weighed,

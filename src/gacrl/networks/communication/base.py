@@ -72,8 +72,6 @@ class Spoken(NamedTuple):
     """What each agent sent in each round."""
     inbox: Any = ()
     """What is carried to the next step."""
-    entropy: Float[Array, " N"] | float = 0.0
-    """Of the symbols sent, in nats, mean over the rounds."""
     loss: Float[Array, " N"] | None = None
     """The kind's own, for each agent: its mean is added to what every learner minimises. None: it has none."""
     weighed: Weighed | None = None

@@ -67,7 +67,7 @@ class Symbols(Communication):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        known, said, entropy = [sighted(near.sight)], [], jnp.zeros(hidden.shape[0])
+        known, said = [sighted(near.sight)], []
         squares = jnp.zeros(hidden.shape[0])
         could_say: list[Array] = []
         scores: list[Array] = []
@@ -81,8 +81,6 @@ class Symbols(Communication):
             logits = encode(meant)
             could_say.append(logits)
             squares += jnp.square(logits).mean(-1)
-            log_symbol = jax.nn.log_softmax(logits)
-            entropy -= (jnp.exp(log_symbol) * log_symbol).sum(-1) / rounds
             draw = None if key is None else jax.random.fold_in(key, number)
             said.append(self.symbol(logits, draw, temperature))
             if self.gate:
@@ -98,7 +96,7 @@ class Symbols(Communication):
         prices = [self.word_price * messages.sum((0, 2))] if self.word_price else []
         prices += [self.logit_price * squares] if self.logit_price else []
         price = sum(prices[1:], prices[0]) if prices else None
-        return Spoken(hidden, messages, (), entropy, price, Weighed(tuple(scores), tuple(could_say)))
+        return Spoken(hidden, messages, loss=price, weighed=Weighed(tuple(scores), tuple(could_say)))
 
     def spoke(
         self, meant: Float[Array, "N M"], number: int, key: PRNGKey | None, temperature: Float[Array, ""] | float
