@@ -169,6 +169,7 @@ def a_room_of_its_own(room, tmp_path, monkeypatch):
 
 
 @pytest.mark.soak
+@pytest.mark.filterwarnings("ignore:The system font")  # pygame's, of SISL's pursuit
 @pytest.mark.parametrize("guide", [guide for guide in GUIDES if guide not in ELSEWHERE])
 def test_every_block_of_a_guide(guide: str, a_room_of_its_own, capsys):
     """One after the other, and Python in one session. Commands for what is not installed say what to install."""
