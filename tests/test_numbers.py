@@ -209,21 +209,20 @@ def by_task(numbers: Callable[[str], Numbers]) -> dict[int, Numbers]:
     return {column: numbers(task) for column, task in enumerate(TALKED, 1)}
 
 
-def of_part(name: str) -> dict[int, Numbers]:
+def of_part(run: dict[str, Any], *metrics: str) -> dict[int, Numbers]:
     """What remains without a part, and the probability that a seed with it is above."""
 
     def found(what: str, metric: str) -> Numbers:
-        return lambda: tuple(_part(name)[what][metric])
+        return lambda: tuple(run[what][metric])
 
-    helps = "probability_that_the_part_helps"
-    return {
-        1: found("intervals", COVERED), 2: found("intervals", RETURN), 3: found("intervals", TOUCHED),
-        **({} if name == "all parts" else {4: found(helps, COVERED), 5: found(helps, RETURN), 6: found(helps, TOUCHED)}),
-    }  # fmt: skip
+    helps = () if run["name"] == "all parts" else metrics
+    columns = [found("intervals", metric) for metric in metrics]
+    columns += [found("probability_that_the_part_helps", metric) for metric in helps]
+    return dict(enumerate(columns, 1))
 
 
-def _part(name: str) -> dict[str, Any]:
-    return next(run for run in read("ablation/summary.json")["runs"] if run["name"] == name)
+def parts(folder: str, *metrics: str) -> dict[str, dict[int, Numbers]]:
+    return {run["name"]: of_part(run, *metrics) for run in read(f"{folder}/summary.json")["runs"]}
 
 
 def oracle(name: str) -> dict[int, Numbers]:
@@ -238,7 +237,6 @@ EQUAL = {
     "graph-vdn, with these three": "graph-vdn-same-5-seeds",
     **{f"graph-{who}": f"graph-{who}-5-seeds" for who in ("vdn", "mappo", "ippo", "qmix")},
 }
-PARTS = [run["name"] for run in read("ablation/summary.json")["runs"]]
 ORACLES = {
     "N = 3, arena 1, 25 steps": "gacrl-10-seeds",
     "N = 3, arena 1, 75 steps": "gacrl-112k-4-seeds",
@@ -315,7 +313,7 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, silenced": by_task(lambda task: of_study(task, "played", "silenced", whole=False)),
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
     },
-    (RESULTS, "What each part is worth", 0): {name: of_part(name) for name in PARTS},
+    (RESULTS, "What each part is worth", 0): parts("ablation", COVERED, RETURN, TOUCHED),
     (RESULTS, "Equal switches", 0): {
         name: {column: interval(file, metric) for column, metric in enumerate((RETURN, COVERED, COVERED_2, ALL_COVERED), 1)}
         for name, file in EQUAL.items()
