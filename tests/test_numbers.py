@@ -314,6 +314,7 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
     },
     (RESULTS, "What each part is worth", 0): parts("ablation", COVERED, RETURN, TOUCHED),
+    (RESULTS, "What each part is worth", 1): parts("ablation-reference", SOLVED, RETURN),
     (RESULTS, "Equal switches", 0): {
         name: {column: interval(file, metric) for column, metric in enumerate((RETURN, COVERED, COVERED_2, ALL_COVERED), 1)}
         for name, file in EQUAL.items()
@@ -489,7 +490,7 @@ UNNOTED = {f"data/{name}.json" for name in ("talk-traffic-easy-3-seeds", "talk-s
 
 @pytest.mark.parametrize(
     "file",
-    ["reproduction/results.json", "ablation/summary.json", "grid/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
+    ["reproduction/results.json", "ablation/summary.json", "ablation-reference/summary.json", "grid/summary.json", *(f"data/{p.name}" for p in sorted((ROOT / "docs" / "data").glob("*.json")))],
 )  # fmt: skip
 def test_every_file_names_the_one_clean_commit_that_made_it(file: str):
     versions = read(file)["versions"]
