@@ -51,7 +51,7 @@ class Table(AgentNetwork):
         if isinstance(memory, AgentMemory):
             head, memory = head + 0.5 * memory.carry, AgentMemory(memory.carry + 1, ())
         near = jnp.zeros((N, N), bool)
-        return AgentOutput(head, head, None, near, 0.0, 0.0), memory
+        return AgentOutput(head, head, None, near, 0.0), memory
 
 
 def features(seed: int, steps: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -80,7 +81,7 @@ def test_a_page_names_a_file_as_it_was_given(monkeypatch: pytest.MonkeyPatch):
     """What resumes a run must find the file from anywhere; a page is read on another machine."""
     monkeypatch.chdir(BEACON.parent)
     name, _ = own.bring(f"{BEACON.name}:Beacon")
-    assert tasks.flag(name) == f" --env {BEACON.absolute()}:Beacon"
+    assert tasks.flag(name) == f" --env {shlex.quote(f'{BEACON.absolute()}:Beacon')}"
     assert tasks.flag(name, as_given=True) == f" --env {BEACON.name}:Beacon"
 
 
