@@ -204,7 +204,10 @@ def test_a_radius_and_a_cut_edge_are_not_heard_across(browser: Any):
     assert at(visit, 0)["main"]["hears"] == hearers
     visit.focus("radius")
     visit.press("Home")
-    assert at(visit, 0)["main"]["hears"] == [[]] * 4 and visit.page.locator("#radius-value").inner_text() == "0.0"
+    visit.page.wait_for_function(
+        "document.querySelector('#radius-value').innerText === '0.0'"
+    )  # drawn with a frame
+    assert at(visit, 0)["main"]["hears"] == [[]] * 4
     visit.close()
 
 
