@@ -1,7 +1,7 @@
 """What rliable and marl-eval make of our results: kept, so that a test holds our own statistics against them.
 
     python -m venv .peers
-    .peers/bin/pip install rliable==1.2.0 "pandas<3" "arch<7.3" seaborn tqdm matplotlib
+    .peers/bin/pip install rliable==1.2.0 "pandas<3" "arch<7.3" seaborn tqdm matplotlib colorama
     .peers/bin/pip install --no-deps id-marl-eval==0.0.4
     PYTHONPATH=src .peers/bin/python benchmarks/outside_statistics.py
 
