@@ -47,7 +47,7 @@ def test_estimates_and_improvements_are_rliables(asked: Any):
 
 
 def test_the_readmes_table_of_baselines_is_rliables():
-    """To the last printed digit; bounds of 2,000 resamples may be one or two off, by chance."""
+    """To the last printed digit; bounds are off by what chance makes of 2,000 resamples."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8").replace("−", "-")
     for who in ("VDN", "QMIX", "IPPO", "MAPPO"):
         line = next(line for line in readme.splitlines() if line.startswith(f"| {who} |"))
@@ -57,7 +57,8 @@ def test_the_readmes_table_of_baselines_is_rliables():
         ):
             theirs = FOUND["rliable"]["each metric, iqm"][f"{who.lower()}/{metric}"]
             assert abs(cell[0] - theirs[0]) <= 0.5 * digit + 1e-9, line
-            np.testing.assert_allclose(cell[1:], theirs[1:], atol=2 * digit, rtol=0)
+            chance = 2 * digit + 0.03 * (theirs[2] - theirs[1])
+            np.testing.assert_allclose(cell[1:], theirs[1:], atol=chance, rtol=0)
 
 
 def test_marl_eval_reads_our_export_as_we_mean_it(asked: Any):
