@@ -104,9 +104,9 @@ def fallen(
 
 def rounded(ratios: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
     """The medians, in three digits."""
+    medians = peers.summary(ratios)["ratio"]
     return {
-        peer: {size: float(f"{statistics.median(values):.3g}") for size, values in sizes.items()}
-        for peer, sizes in ratios.items()
+        peer: {size: float(f"{ratio:.3g}") for size, ratio in sizes.items()} for peer, sizes in medians.items()
     }
 
 
