@@ -36,9 +36,13 @@ def main() -> None:
 
 def _ship(run: Path, name: str, seed: int) -> None:
     member = files.load(run / "config.json").seeds.index(seed)
+    new = (
+        SHIPPED / f"_{name}"
+    )  # what is there goes once the other is whole; a warning, as of a damaged file, ends it
+    shutil.rmtree(new, ignore_errors=True)
+    print(play.save_policy(f"{run}@{member}", new, warn=sys.exit))
     shutil.rmtree(SHIPPED / name, ignore_errors=True)
-    # A warning, as of a damaged checkpoint, ends it.
-    print(play.save_policy(f"{run}@{member}", SHIPPED / name, warn=sys.exit))
+    new.rename(SHIPPED / name)
 
 
 def _write_card(folder: Path, summary: dict[str, Any], seed: int) -> None:
