@@ -47,7 +47,9 @@ def test_links_lead_somewhere(page: Path):
 
 
 def test_every_command_of_the_documents_and_of_help_is_understood(only_parsed: None):
-    written = [page for page in PAGES if page.name != "report.md"]  # the program prints those
+    # The program prints these, in sentences that begin with a preset's name.
+    printed = ("reproduction", "ablation-reference")
+    written = [page for page in PAGES if page.parent.name not in printed]
     texts = [page.read_text(encoding="utf-8") for page in written]
     texts += [cli.OVERVIEW, *(kind.__doc__ or "" for kind in vars(arguments).values() if isinstance(kind, type))]
     said = [words for text in texts for words in commands(text) if "--config" not in words]

@@ -6,7 +6,7 @@ fails, and so does a table without rules.
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -168,7 +168,8 @@ def of_gacrl(name: str) -> dict[str, dict[int, Numbers]]:
 
 BASELINES = ("mappo", "ippo", "vdn", "qmix")
 SCRIPTED = {"random": "random", "doing nothing": "noop", "oracle": "oracle"}
-TALKED = ("speaker_listener", "reference", "colours", "colours-full", "colours-unnamed")
+ANCHORED = ("speaker_listener", "reference", "colours")
+TALKED = (*ANCHORED, "colours-full", "colours-unnamed")
 TALK_ROWS = {
     "speaker_listener": "talk-speaker_listener-10-seeds",
     "reference": "talk-reference-10-seeds",
@@ -205,8 +206,8 @@ def anchored(task: str) -> Numbers:
     return lambda: (json.loads(file.read_text(encoding="utf-8"))["scripted"]["silent"][RETURN],)
 
 
-def by_task(numbers: Callable[[str], Numbers]) -> dict[int, Numbers]:
-    return {column: numbers(task) for column, task in enumerate(TALKED, 1)}
+def by_task(numbers: Callable[[str], Numbers], tasks: Iterable[str] = TALKED) -> dict[int, Numbers]:
+    return {column: numbers(task) for column, task in enumerate(tasks, 1)}
 
 
 def of_part(run: dict[str, Any], *metrics: str) -> dict[int, Numbers]:
@@ -306,7 +307,7 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
     (RESULTS, TALK, 1): {
         "random": by_task(lambda task: of_study(task, "random", whole=False)),
         "silent": by_task(lambda task: of_study(task, "returns", "silent")),
-        "the best silent": dict(list(by_task(anchored).items())[:3]),
+        "the best silent": by_task(anchored, ANCHORED),
         "talking": by_task(lambda task: of_study(task, "returns", "talking")),
         "told": by_task(lambda task: of_study(task, "returns", "told")),
         "talking, a step late": by_task(lambda task: of_study(task, "played", "a step late", whole=False)),
@@ -443,6 +444,12 @@ def lost(metric: str) -> float:
 SENTENCES: list[tuple[str, str, Numbers]] = [
     (README, r"Its four seeds end at a coverage of ([^;]*);", each("gacrl-112k-4-seeds", COVERED)),
     (README, r"Coverage .9 is reached after (.*) environment steps", lambda: (min(FIRST()), max(FIRST()))),
+    (README, r"fall from a return of (\S*) to", of_study("reference", "returns", "talking", whole=False)),
+    (
+        README,
+        r"fall from a return of .* to (.*)\. `gacrl talk`",
+        of_study("reference", "played", "silenced", whole=False),
+    ),
     (README, r"silencing `pretrained:gacrl` costs it (.*) of coverage", lambda: (lost(RETURN), lost(COVERED))),
     (
         RESULTS,
