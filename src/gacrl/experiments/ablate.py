@@ -236,7 +236,7 @@ def _report(
         figures.dots(
             {outcome.name: outcome.final[task.headline] for outcome in ended},
             {outcome.name: estimate(outcome.final[task.headline]) for outcome in ended},
-            task.headline,
+            task.metrics[task.headline].axis,
         ),
         "Every seed is a dot, below them the interquartile mean and its 95 % interval.",
         "parts",
@@ -244,7 +244,9 @@ def _report(
     page.heading("Along training")
     page.figure(
         figures.curves(
-            {o.name: _series(o, sample_efficiency(o.along)) for o in ended}, "environment steps", task.headline
+            {o.name: _series(o, sample_efficiency(o.along)) for o in ended},
+            "environment steps",
+            task.metrics[task.headline].axis,
         ),
         f"{task.headline} of {config.evaluation.num_episodes} greedy episodes: interquartile mean, 95 % interval.",
         "curves",

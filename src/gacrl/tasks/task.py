@@ -37,6 +37,12 @@ class Metric(NamedTuple):
         """What makes more of it better: 1 or −1."""
         return 1.0 if self.higher_is_better else -1.0
 
+    @property
+    def axis(self) -> str:
+        """What the axis of a figure calls it: with its unit."""
+        name = self.label or self.measure.replace("_", " ")
+        return f"{name} ({self.unit})" if self.unit else name
+
 
 class Words(NamedTuple):
     """What a picture calls the things in it."""
