@@ -4,13 +4,16 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: train test soak cluster plain-path lint types docs bench bench-short release lock clean
+.PHONY: train test slow soak cluster plain-path lint types docs bench bench-short release lock clean
 
 train: $(STAMP)  ## the default preset: where its summary and GIF lie is printed at the end
 	"$(BIN)/gacrl" train
 
 test: $(STAMP)
 	"$(BIN)/python" -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+
+slow: $(STAMP)  ## what CI runs besides
+	"$(BIN)/python" -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m slow
 
 soak: $(STAMP)  ## what is too slow for every change
 	"$(BIN)/python" -m pytest -m soak

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")  # compiles in half the time
+# Compiles in half the time, and each program in one piece.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
 
 os.environ.pop("COLUMNS", None)  # what is printed is as wide as in a log, wherever the tests run
 
@@ -171,14 +172,13 @@ def browser() -> Iterator[Any]:
         yield found
 
 
-def soaked(cases: Iterable[Any], *kept: Any) -> list[Any]:
-    """The cases, all of them soaked except those that are kept: each compiles programs of its own."""
-    return [
-        pytest.param(
-            *(case if isinstance(case, tuple) else (case,)), marks=[pytest.mark.soak] * (case not in kept)
-        )
-        for case in cases
-    ]
+def soaked(cases: Iterable[Any], *kept: Any, slow: Iterable[Any] = ()) -> list[Any]:
+    """The cases: those that are kept, those that CI runs besides, and all others soaked. Each compiles its own programs."""
+
+    def mark(case: Any) -> list[Any]:
+        return [] if case in kept else [pytest.mark.slow] if case in slow else [pytest.mark.soak]
+
+    return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=mark(case)) for case in cases]
 
 
 def drawn(build: Any, *settings: Any, seed: int = 0) -> Any:

@@ -113,6 +113,7 @@ def test_exploration_of_your_own(example: Callable[[str], Any], tmp_path: Path, 
     assert run.summary is not None
 
 
+@pytest.mark.slow
 def test_an_algorithm_of_your_own(example: Callable[[str], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """REINFORCE learns to talk; its run folder is evaluated as any other."""
     run = example("own_algorithm").main(env_steps=40_000, out=tmp_path / "run")

@@ -43,7 +43,7 @@ class Slots(Environment):
         return observe(jax.nn.one_hot(state["age"], 2), num_actions=2)
 
 
-@pytest.mark.parametrize("recurrent", [False, True])
+@pytest.mark.parametrize("recurrent", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("kind", [IppoConfig, IqlConfig])
 def test_values_end_with_a_life(kind: Any, recurrent: bool):
     """1 in a life's second step and γ in its first; bootstrapped into the next life they would be 5.3 and 4.7."""

@@ -44,11 +44,11 @@ def quick_references(monkeypatch: pytest.MonkeyPatch) -> None:
     ("words", "text", "told"),
     [
         (["--silence"], "silence", "nobody hears anybody"),
-        (["--silence", "1"], "silence 1", "nobody hears agent 1"),
+        pytest.param(["--silence", "1"], "silence 1", "nobody hears agent 1", marks=pytest.mark.slow),
         (["--silence", "0", "2"], "silence 0 2", "nobody hears agents 0 and 2"),
         (["--scramble"], "scramble", "every agent is heard with its words from another episode"),
         (["--drop", "0.25"], "drop 0.25", "each edge loses its messages in 25 % of the steps"),
-        (["--delay", "1"], "delay 1", "words arrive 1 step late"),
+        pytest.param(["--delay", "1"], "delay 1", "words arrive 1 step late", marks=pytest.mark.slow),
         (["--delay", "3"], "delay 3", "words arrive 3 steps late"),
     ],
     ids=lambda value: value if isinstance(value, str) and " " not in value else None,

@@ -87,7 +87,9 @@ def test_a_task_that_knows_no_quicker_way_is_mapped():
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("kind", [pytest.param(jnp.asarray, marks=pytest.mark.soak), np.asarray])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(jnp.asarray, marks=pytest.mark.soak), pytest.param(np.asarray, marks=pytest.mark.slow)]
+)
 def test_keys_that_are_numbers_draw_what_keys_draw(kind: Any):
     """What `jax.random.PRNGKey` makes is an array of two numbers, and no two copies of anything."""
     env = Spread(3, 2, reset_on_collision="in_place", reset_distance=5.0)

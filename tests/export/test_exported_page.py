@@ -133,7 +133,7 @@ def in_node(folder: Path, script: str, data: dict[str, Any]) -> dict[str, Any]:
     "run",
     [
         pytest.param(lambda: shipped("gacrl"), marks=pytest.mark.soak),
-        lambda: shipped("gacrl-teams", num_agents=16, arena_scale=1.5),
+        pytest.param(lambda: shipped("gacrl-teams", num_agents=16, arena_scale=1.5), marks=pytest.mark.slow),
         lambda: shipped("gacrl-reference"),
         pytest.param(lambda: shipped("gacrl-colours"), marks=pytest.mark.soak),
         pytest.param(lambda: untrained("speaker_listener", {"latent": "none"}), marks=pytest.mark.soak),

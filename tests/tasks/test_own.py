@@ -327,6 +327,7 @@ def test_a_source_that_has_changed_is_one_warning(
     assert warned == f"gacrl: {source} has changed since {run} was made: the task is played as it is now\n"
 
 
+@pytest.mark.slow
 def test_another_training_starts_with_its_policy(
     trained: tuple[Path, Path], tmp_path: Path, said_of: Callable[..., str]
 ):
@@ -361,6 +362,7 @@ def test_another_training_starts_with_its_policy(
     assert "there is no @2" in said_of(*words, "--from", f"{run}@2", "--out", tmp_path / "third")
 
 
+@pytest.mark.slow
 def test_a_training_that_starts_from_another_is_not_lost_before_its_first_checkpoint(
     trained: tuple[Path, Path], tmp_path: Path
 ):

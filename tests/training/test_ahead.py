@@ -42,7 +42,9 @@ def compiled() -> Iterator[Counter[str]]:
     log.removeHandler(handler)
 
 
-@pytest.mark.parametrize("seeds", [pytest.param(1, marks=pytest.mark.soak), 2])
+@pytest.mark.parametrize(
+    "seeds", [pytest.param(1, marks=pytest.mark.soak), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_a_run_compiles_each_of_its_programs_once(seeds: int, tmp_path: Path, compiled: Counter[str]):
     """What is compiled ahead is what is called later: another layout, and XLA would compile it again, unseen."""
     small = {

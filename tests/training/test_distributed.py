@@ -91,6 +91,7 @@ def assert_same(file: Path, expected: dict[str, np.ndarray], seeds: int, strays:
     assert_nearly_same(found, {path: leaf[:seeds] for path, leaf in expected.items()}, strays)
 
 
+@pytest.mark.slow
 def test_environments_on_eight_devices_and_on_two_processes(job: Job, tmp_path: Path):
     """PPO: two seeds with four devices each, and one seed on two processes, learn what they learn on one device."""
     (tmp_path / "eight").mkdir()

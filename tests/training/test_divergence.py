@@ -62,6 +62,7 @@ def nothing_played(self: Trainer, *_: Any) -> dict[str, np.ndarray]:
 vars(nothing_played)["lower"] = lambda *_: SimpleNamespace(compile=lambda: None)
 
 
+@pytest.mark.slow
 def test_a_run_that_diverges_stops_within_a_chunk_and_can_be_looked_into(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -20,10 +20,10 @@ from gacrl.training.watching import Watcher
 pytestmark = pytest.mark.usefixtures("one_trainer")
 
 TIMES = ("steps_per_second", "compile_seconds", "wall_seconds")
-FAMILIES = ("vdn", "mappo")
-"""One of each learner, for every change; the paper's is in test_resume.py, and `make soak` takes them all."""
+FAMILIES = {"mappo": [], "vdn": [pytest.mark.slow]}
+"""One of each learner; the paper's is in test_resume.py, and `make soak` takes them all."""
 ALL = [
-    pytest.param(name, marks=[] if name in FAMILIES else [pytest.mark.soak])
+    pytest.param(name, marks=FAMILIES.get(name, [pytest.mark.soak]))
     for name in PRESETS
     if name not in ("gacrl-112k", "gacrl-teams")  # gacrl with other numbers
     and not name.startswith("graph-")  # learners of the others

@@ -111,7 +111,9 @@ TALKS = {
 }
 
 
-@pytest.mark.parametrize("name", soaked(TALKS, "discrete, delay 2", "discrete, drop 0.4", "gated, noise 0.5"))
+@pytest.mark.parametrize(
+    "name", soaked(TALKS, "discrete, delay 2", "discrete, drop 0.4", slow=["gated, noise 0.5"])
+)
 def test_the_first_ratio_of_ppo_is_one_whatever_arrives(name: str):
     """The agents' words are drawn. Without what arrived, the ratio is another one."""
     network, text = TALKS[name]
@@ -163,7 +165,7 @@ REPLAYED = [
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    soaked(REPLAYED, ("gacrl", "swap 0 2"), ("gacrl, recurrent", "delay 2"), ("dial", "drop 0.4")),
+    soaked(REPLAYED, ("gacrl", "swap 0 2"), ("gacrl, recurrent", "delay 2"), slow=[("dial", "drop 0.4")]),
 )
 def test_the_replay_of_q_learning_holds_what_arrived_and_windows_hear_it(name: str, text: str):
     """Windows that are read back say the values that the agents acted on; nothing is drawn here."""
@@ -216,7 +218,7 @@ SILENCED = {
 }
 
 
-@pytest.mark.parametrize("name", soaked(SILENCED, "gacrl", "mappo"))
+@pytest.mark.parametrize("name", soaked(SILENCED, "gacrl", slow=["mappo"]))
 def test_to_train_in_silence_is_to_train_where_no_edge_is(name: str):
     """Six updates: the same weights and metrics. With words they are others."""
 

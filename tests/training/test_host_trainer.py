@@ -73,7 +73,9 @@ def tiny(preset: str, env: Any, **changes: Any) -> RunConfig:
 @pytest.mark.parametrize(
     ("preset", "seeds", "changes", "intervention"),
     [
-        ("ippo", (3, 4), {"communication": "discrete", "recurrent": True}, "drop 0.4"),
+        pytest.param(
+            *("ippo", (3, 4), {"communication": "discrete", "recurrent": True}, "drop 0.4"), marks=pytest.mark.slow
+        ),
         pytest.param("vdn", (3,), {}, "", marks=pytest.mark.soak),  # an update in every step
     ],
 )

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import drawn_learner
+from conftest import drawn_learner, soaked
 
 from gacrl import rollout
 from gacrl.algorithms import build as algorithms
@@ -51,13 +51,10 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-TWINS = ("mappo", "iql", "qmix")
-"""Their agents are IPPO's and VDN's: they are soaked, and all kinds of GACRL's but one."""
-PAIRS = [
-    pytest.param(name, kind, marks=[pytest.mark.soak] * (name in TWINS or (name == "gacrl" and kind != "gated")))
-    for name in LEARNERS
-    for kind in KINDS
-]
+KEPT = [("gacrl", "gated"), ("vdn", "gated"), ("ippo", "told"), ("ippo", "tarmac"), ("ippo", "ic3net")]
+SLOW = [("ippo", "gated"), ("vdn", "told"), ("vdn", "tarmac"), ("vdn", "ic3net")]
+"""The agents of MAPPO, IQL and QMIX are IPPO's and VDN's: they are soaked, and other kinds of GACRL's."""
+PAIRS = soaked([(name, kind) for name in LEARNERS for kind in KINDS], *KEPT, slow=SLOW)
 
 
 @pytest.mark.parametrize(("name", "kind"), PAIRS)

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import pytest
+from conftest import soaked
 
 from gacrl.algorithms import build
 from gacrl.config import presets
@@ -97,9 +98,7 @@ TWINS = ("ippo", "vdn")
 """Commnet without its channel, and DIAL: what they learn is soaked, and seen by the doctor."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.soak) if name in TWINS else name for name in BASELINES]
-)
+@pytest.mark.parametrize("name", soaked(BASELINES, *set(BASELINES) - {*TWINS, "dial"}, slow=["dial"]))
 def test_a_baseline_learns_what_it_can(name: str):
     """To act, to tell what will come a step later (γ = 0.95), and to talk where it has a channel, not where not.
 

@@ -298,7 +298,9 @@ def told(env: TrafficJunction, route: int, cell: np.ndarray, act: int, counts: n
 # The task.
 
 
-@pytest.mark.parametrize(("level", "gas"), [("easy", 0.279), ("medium", 0.032), ("hard", 0.077)])
+@pytest.mark.parametrize(
+    ("level", "gas"), [("easy", 0.279), ("medium", 0.032), pytest.param("hard", 0.077, marks=pytest.mark.slow)]
+)
 def test_scripted_policies_reach_what_is_known_of_them(level: Any, gas: float):
     """Gas: IC3Net's own program, 20,000 (medium 6,000) episodes. Within four standard errors."""
     settings = TrafficSettings(level=level)
