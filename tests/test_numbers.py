@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from gacrl.evaluation.statistics import estimate, mean, probability_of_improvement
+from gacrl.experiments.talking.kinds import kinds
 
 ROOT = Path(__file__).parent.parent
 README, RESULTS = "README.md", "docs/results.md"
@@ -124,6 +126,23 @@ def of_study(task: str, *path: str, whole: bool = True) -> Numbers:
         for word in path:
             values = values[word]
         return tuple(estimate(values, mean)) if whole else (float(np.mean(values)),)
+
+    return found
+
+
+def of_cell(case: str, kind: str, what: str) -> Numbers:
+    """Of a learner of the study of kinds, where it is there: its score with the interval, or steps to .9.
+
+    Steps are in thousands, the median of the seeds that came so far; where some did not: of how many.
+    """
+
+    def found() -> tuple[float, ...]:
+        cell = data("talk-study")["cases"][case]["kinds"].get(kind)
+        if cell is None or what == "score":
+            return () if cell is None else tuple(cell["score"])
+        came = [steps for steps in cell["steps_to_.9"] if steps is not None]
+        middle = (float(np.median(came)) / 1_000,) if came else ()
+        return middle if len(came) in (0, len(cell["seeds"])) else (*middle, len(came), len(cell["seeds"]))
 
     return found
 
@@ -330,6 +349,10 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, a step late": by_task(lambda task: of_study(task, "played", "a step late", whole=False)),
         "talking, silenced": by_task(lambda task: of_study(task, "played", "silenced", whole=False)),
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
+    },
+    (RESULTS, "Kinds of communication", 0): {
+        kind: {column: of_cell(case, kind, what) for column, (case, what) in enumerate(product(ANCHORED, ("score", "steps")), 1)}
+        for kind in kinds()
     },
     (RESULTS, "What each part is worth", 0): parts("ablation", COVERED, RETURN, TOUCHED),
     (RESULTS, "What each part is worth", 1): parts("ablation-reference", SOLVED, RETURN),
