@@ -131,15 +131,15 @@ def of_study(task: str, *path: str, whole: bool = True) -> Numbers:
 
 
 def of_cell(case: str, kind: str, what: str) -> Numbers:
-    """Of a learner of the study of kinds, where it is there: its score with the interval, or steps to .9.
+    """Of a learner of the study of kinds, where it is there: its score with the interval, bits, or steps to .9.
 
     Steps are in thousands, the median of the seeds that came so far; where some did not: of how many.
     """
 
     def found() -> tuple[float, ...]:
         cell = data("talk-study")["cases"][case]["kinds"].get(kind)
-        if cell is None or what == "score":
-            return () if cell is None else tuple(cell["score"])
+        if cell is None or what != "steps":
+            return () if cell is None or cell[what] is None else tuple(np.atleast_1d(cell[what]))
         came = [steps for steps in cell["steps_to_.9"] if steps is not None]
         middle = (float(np.median(came)) / 1_000,) if came else ()
         return middle if len(came) in (0, len(cell["seeds"])) else (*middle, len(came), len(cell["seeds"]))
@@ -351,7 +351,10 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
     },
     (RESULTS, "Kinds of communication", 0): {
-        kind: {column: of_cell(case, kind, what) for column, (case, what) in enumerate(product(ANCHORED, ("score", "steps")), 1)}
+        kind: {
+            1: of_cell("reference", kind, "bits"),
+            **{column: of_cell(case, kind, what) for column, (case, what) in enumerate(product(ANCHORED, ("score", "steps")), 2)},
+        }
         for kind in kinds()
     },
     (RESULTS, "What each part is worth", 0): parts("ablation", COVERED, RETURN, TOUCHED),

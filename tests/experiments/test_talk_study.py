@@ -137,6 +137,10 @@ def test_scores_run_from_the_best_silent_policy_to_the_best_told_one(
     assert [config.algorithm.network.communication for config in trained[before:]] == ["tarmac"], "one cell is new"
     kept = json.loads((out / "summary.json").read_text(encoding="utf-8"))["cases"]["reference"]["kinds"]
     assert list(kept) == ["none", "told", "discrete", "dial", "tarmac"], "the report shows all that are there"
+    assert main([*words[:4], "qmix", "mappo-10x", "--seeds", "3", "--out", str(out)]) == 0
+    drawn = (out / "report-figures" / "case-reference.svg").read_text(encoding="utf-8")
+    assert all(f">{kind}<" in drawn for kind in ("none", "discrete", "qmix")), "a curve each"
+    assert "mappo-10x" not in drawn, "whose curve is ten times as long"
     assert main(["talk", "--seeds", "4", "--out", str(out)]) == 2
     assert "holds another study" in capsys.readouterr().err
 
