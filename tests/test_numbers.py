@@ -118,16 +118,22 @@ def first_seen(name: str, metric: str, scale: float = 1.0) -> Numbers:
     return found
 
 
-def of_study(task: str, *path: str, whole: bool = True) -> Numbers:
-    """The mean over the seeds of a learner of a study of talk, with its interval or without."""
+def each_of_study(task: str, *path: str) -> Numbers:
+    """Every seed of a learner of a study of talk."""
 
     def found() -> tuple[float, ...]:
         values: Any = data(f"talk-{task}-study")
         for word in path:
             values = values[word]
-        return tuple(estimate(values, mean)) if whole else (float(np.mean(values)),)
+        return tuple(np.atleast_1d(values))
 
     return found
+
+
+def of_study(task: str, *path: str, whole: bool = True) -> Numbers:
+    """The mean over those seeds, with its interval or without."""
+    values = each_of_study(task, *path)
+    return lambda: tuple(estimate(np.array(values()), mean)) if whole else (float(np.mean(values())),)
 
 
 def of_cell(case: str, kind: str, what: str) -> Numbers:
@@ -212,6 +218,11 @@ TALK_ROWS = {
     "colours, ring, unnamed": "talk-colours-unnamed-10-seeds",
     "colours, ring": "talk-colours-10-seeds",
     "colours, full graph": "talk-colours-full-10-seeds",
+}
+TRAFFIC = {
+    "values of before, 800,000 steps": "talk-traffic-easy-3-seeds",
+    "today's, 800,000 steps": "talk-traffic-easy-800k-3-seeds",
+    "today's, 2,000,000 steps": "talk-traffic-easy-2m-3-seeds",
 }
 SOLVES, TALK = "GACRL that solves the task", "Tasks that need talk"
 IN_MPE2 = "gacrl-10-seeds-mpe2"
@@ -349,6 +360,12 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, a step late": by_task(lambda task: of_study(task, "played", "a step late", whole=False)),
         "talking, silenced": by_task(lambda task: of_study(task, "played", "silenced", whole=False)),
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
+    },
+    (RESULTS, TALK, 2): {
+        **{row: {1: each(name, "success"), 2: each(name, RETURN), 3: each(name, "crashes")} for row, name in TRAFFIC.items()},
+        **{who: {1: each_of_study("traffic", "further", "success", who), 2: each_of_study("traffic", "returns", who),
+                 3: each_of_study("traffic", "further", "crashes", who)} for who in ("told", "silent")},
+        "yielder": {column: beside("talk-traffic-easy-2m-3-seeds", "yielder", metric) for column, metric in enumerate(("success", RETURN), 1)},
     },
     (RESULTS, "Kinds of communication", 0): {
         kind: {
@@ -502,10 +519,21 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"in the return and (.*?) in coverage; above", above("graph-vdn-5-seeds", COVERED)),
     (RESULTS, r"with these three, (.*?) and .38", above("graph-vdn-same-5-seeds", RETURN)),
     (RESULTS, r"with these three, .84 .*? and (.*?): five seeds", above("graph-vdn-same-5-seeds", COVERED)),
-    (RESULTS, r"512 episodes, success ([^,]*),", each("talk-traffic-easy-3-seeds", "success")),
-    (RESULTS, r"1.0 .986 .996, return ([^(]*) \(", each("talk-traffic-easy-3-seeds", RETURN)),
-    (RESULTS, r"crashes an episode ([^(]*) \(", each("talk-traffic-easy-3-seeds", "crashes")),
-    (RESULTS, r"\(yielder ([^)]*)\)", beside("talk-traffic-easy-3-seeds", "yielder", "success", RETURN)),
+    (
+        RESULTS,
+        r"success (\S*) silenced, ",
+        of_study("traffic", "further", "success", "talking, silenced", whole=False),
+    ),
+    (
+        RESULTS,
+        r"silenced, (\S*) scrambled, ",
+        of_study("traffic", "further", "success", "talking, scrambled", whole=False),
+    ),
+    (
+        RESULTS,
+        r"scrambled, (\S*) a step late\.",
+        of_study("traffic", "further", "success", "talking, a step late", whole=False),
+    ),
     (RESULTS, r"talk-beacon-study.json\)\): silent ([^]]*\])", of_study("beacon", "returns", "silent")),
     (RESULTS, r"the talking ones silenced ([^]]*\])", of_study("beacon", "played", "silenced")),
     (RESULTS, r"scrambled (1\.[^]]*\])", of_study("beacon", "played", "scrambled")),
