@@ -219,6 +219,7 @@ TALK_ROWS = {
     "colours, ring": "talk-colours-10-seeds",
     "colours, full graph": "talk-colours-full-10-seeds",
 }
+MEDIUM = "talk-traffic-medium-vision1-3-seeds"
 TRAFFIC = {
     "values of before, 800,000 steps": "talk-traffic-easy-3-seeds",
     "today's, 800,000 steps": "talk-traffic-easy-800k-3-seeds",
@@ -519,6 +520,9 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"in the return and (.*?) in coverage; above", above("graph-vdn-5-seeds", COVERED)),
     (RESULTS, r"with these three, (.*?) and .38", above("graph-vdn-same-5-seeds", RETURN)),
     (RESULTS, r"with these three, .84 .*? and (.*?): five seeds", above("graph-vdn-same-5-seeds", COVERED)),
+    (RESULTS, r"on one core\), success ([^,]*),", each(MEDIUM, "success")),
+    (RESULTS, r".969 .801 .869, return ([^(]*) \(", each(MEDIUM, RETURN)),
+    (RESULTS, r"−6.73 \(yielder ([^;]*);", beside(MEDIUM, "yielder", "success", RETURN)),
     (
         RESULTS,
         r"success (\S*) silenced, ",
