@@ -36,13 +36,12 @@ def main() -> None:
 
 def _ship(run: Path, name: str, seed: int) -> None:
     member = files.load(run / "config.json").seeds.index(seed)
-    new = (
-        SHIPPED / f"_{name}"
-    )  # what is there goes once the other is whole; a warning, as of a damaged file, ends it
+    # The old policy goes once the new one is whole. A warning, as of a damaged checkpoint, ends it.
+    shipped, new = SHIPPED / name, SHIPPED / f"_{name}"
     shutil.rmtree(new, ignore_errors=True)
-    print(play.save_policy(f"{run}@{member}", new, warn=sys.exit))
-    shutil.rmtree(SHIPPED / name, ignore_errors=True)
-    new.rename(SHIPPED / name)
+    play.save_policy(f"{run}@{member}", new, warn=sys.exit)
+    shutil.rmtree(shipped, ignore_errors=True)
+    print(new.rename(shipped))
 
 
 def _write_card(folder: Path, summary: dict[str, Any], seed: int) -> None:

@@ -204,9 +204,8 @@ def test_a_radius_and_a_cut_edge_are_not_heard_across(browser: Any):
     assert at(visit, 0)["main"]["hears"] == hearers
     visit.focus("radius")
     visit.press("Home")
-    visit.page.wait_for_function(
-        "document.querySelector('#radius-value').innerText === '0.0'"
-    )  # drawn with a frame
+    # It is drawn with the next frame.
+    visit.page.wait_for_function("document.querySelector('#radius-value').innerText === '0.0'")
     assert at(visit, 0)["main"]["hears"] == [[]] * 4
     visit.close()
 

@@ -232,11 +232,12 @@ def _report(
     _results(page, task, config, outcomes)
     _what_parts_are_worth(page, task, outcomes)
     ended = [outcome for outcome in outcomes if outcome.diverged is None]
+    axis = task.metric(task.headline).axis
     page.figure(
         figures.dots(
             {outcome.name: outcome.final[task.headline] for outcome in ended},
             {outcome.name: estimate(outcome.final[task.headline]) for outcome in ended},
-            task.metrics[task.headline].axis,
+            axis,
         ),
         "Every seed is a dot, below them the interquartile mean and its 95 % interval.",
         "parts",
@@ -246,7 +247,7 @@ def _report(
         figures.curves(
             {o.name: _series(o, sample_efficiency(o.along)) for o in ended},
             "environment steps",
-            task.metrics[task.headline].axis,
+            axis,
         ),
         f"{task.headline} of {config.evaluation.num_episodes} greedy episodes: interquartile mean, 95 % interval.",
         "curves",
@@ -285,7 +286,7 @@ def _exploration(page: Page, task: Task, ended: Sequence[Outcome]) -> None:
 
 
 def _results(page: Page, task: Task, config: RunConfig, outcomes: Sequence[Outcome]) -> None:
-    """What each of the runs reached."""
+    """Add what each of the runs reached."""
     shown = task.shown(list(outcomes[0].final))
     rows: list[list[str]] = []
     known = parts_of(config)
@@ -300,7 +301,7 @@ def _results(page: Page, task: Task, config: RunConfig, outcomes: Sequence[Outco
 
 
 def _what_parts_are_worth(page: Page, task: Task, outcomes: Sequence[Outcome]) -> None:
-    """What may be said of each part in any metric, and the probabilities in those of the tables."""
+    """Add what may be said of each part in any metric, and the probabilities in those of the tables."""
     full = outcomes[0]
     shown = task.shown(list(full.final))
     found = {o.name: worths(task, full.final, o.final) for o in outcomes[1:] if o.diverged is None}

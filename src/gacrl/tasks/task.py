@@ -34,18 +34,22 @@ class Metric(NamedTuple):
 
     @property
     def sign(self) -> float:
-        """What makes more of it better: 1 or −1."""
+        """Return what makes more of it better: 1 or −1."""
         return 1.0 if self.higher_is_better else -1.0
 
     @property
     def axis(self) -> str:
-        """What the axis of a figure calls it: with its unit."""
-        name = self.label or self.measure.replace("_", " ")
-        return f"{name} ({self.unit})" if self.unit else name
+        """Return what the axis of a figure calls it: with its unit."""
+        return with_unit(self.label or self.measure.replace("_", " "), self.unit)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Write a name with its unit, if there is one."""
+    return f"{name} ({unit})" if unit else name
 
 
 class Words(NamedTuple):
-    """What a picture calls the things in it."""
+    """Names what a picture calls the things in it."""
 
     agent: str = "agent"
     mark: str = "place"

@@ -30,6 +30,7 @@ from gacrl.experiments.compare.finished import (
     require_same_task,
 )
 from gacrl.experiments.compare.groups import NOT_SETTINGS, Group, grouped
+from gacrl.tasks.task import with_unit
 from gacrl.versions import DIRTY
 
 SHOWN = 2
@@ -137,8 +138,7 @@ class Comparison:
         if metric.startswith("score_"):
             low, high = self.facts["scale"]
             return f"{self.label(metric)} (0: {low}, 1: {high})"
-        unit = self.facts.get("units", {}).get(metric)  # runs of version 0.1.0 have none
-        return f"{self.label(metric)} ({unit})" if unit else self.label(metric)
+        return with_unit(self.label(metric), self.facts.get("units", {}).get(metric, ""))  # version 0.1.0 has none
 
     def lower_is_better(self, metric: str) -> bool:
         """Return whether less of it is more."""

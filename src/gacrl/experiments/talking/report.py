@@ -100,21 +100,24 @@ def _case(made: Page, case: Played) -> None:
             ],
             "Scores of the same agents, by what happens to their messages.",
         )
+    _curves(made, case)
+
+
+def _curves(made: Page, case: Played) -> None:
+    """Add a figure of the learners that took equally many steps."""
+    headline, floor, ceiling = case.task.headline, case.floor, case.ceiling
     equally_long = min(ended.config.training.env_steps for ended in case.learners.values())
     curves = {
         kind: (ended.evaluated_at, *_band(ended, headline), None)
         for kind, ended in case.learners.items()
         if ended.final and ended.config.training.env_steps == equally_long
     }
-    if curves:
-        floor, ceiling = case.floor, case.ceiling
-        lines = {f"floor: {floor.who}": floor.value}
-        lines |= {f"ceiling: {ceiling.who}": ceiling.value} if ceiling else {}
-        shown = case.task.metric(headline).axis
-        drawn = figures.curves(curves, "environment steps", shown, lines, begin=0.0)
-        made.figure(
-            drawn, f"{headline} along training: mean over seeds and its 95 % interval.", f"case-{case.name}"
-        )
+    if not curves:
+        return
+    lines = {f"floor: {floor.who}": floor.value}
+    lines |= {f"ceiling: {ceiling.who}": ceiling.value} if ceiling else {}
+    drawn = figures.curves(curves, "environment steps", case.task.metric(headline).axis, lines, begin=0.0)
+    made.figure(drawn, f"{headline} along training: mean over seeds and its 95 % interval.", f"case-{case.name}")
 
 
 def _says(case: Played) -> str:
