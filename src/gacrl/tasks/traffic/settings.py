@@ -46,7 +46,6 @@ class TrafficSettings:
     def __post_init__(self) -> None:
         take_types("env", self)
         require(self.level in LEVELS, unknown("env.level", self.level, LEVELS))
-        take_types("env", self)
         between("env", self, 0, LEVELS[self.level].grid - 1, "vision")
         between("env", self, 1, 1_000_000, "max_cycles")
         between("env", self, 0.0, 1.0, "arrival_start")
