@@ -118,6 +118,14 @@ def first_seen(name: str, metric: str, scale: float = 1.0) -> Numbers:
     return found
 
 
+DRIVEN = ("success", RETURN, "crashes")
+
+
+def junction(name: str) -> dict[int, Numbers]:
+    """What cars of every seed did, by column."""
+    return {column: each(name, metric) for column, metric in enumerate(DRIVEN, 1)}
+
+
 def each_of_study(task: str, *path: str) -> Numbers:
     """Every seed of a learner of a study of talk."""
 
@@ -219,11 +227,18 @@ TALK_ROWS = {
     "colours, ring": "talk-colours-10-seeds",
     "colours, full graph": "talk-colours-full-10-seeds",
 }
-MEDIUM = "talk-traffic-medium-vision1-3-seeds"
+MEDIUM = {
+    "vision 1, 25 environments": "talk-traffic-medium-vision1-3-seeds",
+    "vision 1, 100 environments": "talk-traffic-medium-vision1-2m-3-seeds",
+    "the same, silenced": "talk-traffic-medium-vision1-2m-silenced",
+    "vision 0": "talk-traffic-medium-5m-3-seeds",
+}
 TRAFFIC = {
     "values of before, 800,000 steps": "talk-traffic-easy-3-seeds",
     "today's, 800,000 steps": "talk-traffic-easy-800k-3-seeds",
     "today's, 2,000,000 steps": "talk-traffic-easy-2m-3-seeds",
+    "γ .95 and 100 environments": "talk-traffic-easy-100-environments-3-seeds",
+    "the same and 64 units": "talk-traffic-easy-64-units-3-seeds",
 }
 SOLVES, TALK = "GACRL that solves the task", "Tasks that need talk"
 IN_MPE2 = "gacrl-10-seeds-mpe2"
@@ -363,10 +378,15 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
         "talking, scrambled": by_task(lambda task: of_study(task, "played", "scrambled", whole=False)),
     },
     (RESULTS, TALK, 2): {
-        **{row: {1: each(name, "success"), 2: each(name, RETURN), 3: each(name, "crashes")} for row, name in TRAFFIC.items()},
+        **{row: junction(name) for row, name in TRAFFIC.items()},
         **{who: {1: each_of_study("traffic", "further", "success", who), 2: each_of_study("traffic", "returns", who),
                  3: each_of_study("traffic", "further", "crashes", who)} for who in ("told", "silent")},
-        "yielder": {column: beside("talk-traffic-easy-2m-3-seeds", "yielder", metric) for column, metric in enumerate(("success", RETURN), 1)},
+        "yielder": {column: beside("talk-traffic-easy-2m-3-seeds", "yielder", metric) for column, metric in enumerate(DRIVEN[:2], 1)},
+    },
+    (RESULTS, TALK, 3): {
+        **{row: junction(name) for row, name in MEDIUM.items()},
+        **{row: {column: beside("talk-traffic-medium-5m-3-seeds", who, metric) for column, metric in enumerate(DRIVEN, 1)}
+           for row, who in {"yielder": "yielder", "never braking": "noop"}.items()},
     },
     (RESULTS, "Kinds of communication", 0): {
         kind: {
@@ -520,9 +540,6 @@ SENTENCES: list[tuple[str, str, Numbers]] = [
     (RESULTS, r"in the return and (.*?) in coverage; above", above("graph-vdn-5-seeds", COVERED)),
     (RESULTS, r"with these three, (.*?) and .38", above("graph-vdn-same-5-seeds", RETURN)),
     (RESULTS, r"with these three, .84 .*? and (.*?): five seeds", above("graph-vdn-same-5-seeds", COVERED)),
-    (RESULTS, r"on one core\), success ([^,]*),", each(MEDIUM, "success")),
-    (RESULTS, r".969 .801 .869, return ([^(]*) \(", each(MEDIUM, RETURN)),
-    (RESULTS, r"−6.73 \(yielder ([^;]*);", beside(MEDIUM, "yielder", "success", RETURN)),
     (
         RESULTS,
         r"success (\S*) silenced, ",
