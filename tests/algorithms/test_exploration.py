@@ -1,6 +1,5 @@
 """Rules of exploration: their levels by hand, what they follow, and PPO that takes random actions among its own."""
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -101,21 +100,6 @@ def test_in_time_episodes_are_all_alike(name: str):
     assert (rule.init(), rule.initial_memory) == ((), ())
     assert rule.begin((), jax.random.key(0), 0.3) == ((), 0.3)
     assert rule.follow((), FOUR_STEPS) == ()
-
-
-@pytest.mark.parametrize("name", ["none", "linear", "fixed", "adaptive"])
-def test_symbols_that_are_soft_first_lose_their_temperature_at_a_step(name: str):
-    """Of the rule all else stays; without such symbols it is the rule itself."""
-    network = NetworkConfig(communication="discrete", symbols="soft_first")
-    settings = replace(SETTINGS, exploration=name, network=network, soft_steps=120)
-    rule, plain = (exploration.rule_of(s, 1_000, MEASURE) for s in (settings, replace(SETTINGS, exploration=name)))
-    assert rule.moves and plain.moves == (name in ("linear", "adaptive"))
-    for env_steps in (0, 119, 120, 10**6):
-        expected = level(plain, env_steps, plain.init())
-        expected = expected._replace(temperature=expected.temperature if env_steps < 120 else 0.0)
-        np.testing.assert_allclose(level(rule, env_steps, rule.init()), expected, rtol=1e-6)
-    others = replace(settings, network=replace(network, communication="soft"))
-    assert exploration.rule_of(others, 1_000, MEASURE).moves == plain.moves
 
 
 # Levels that follow progress.

@@ -116,29 +116,6 @@ def test_soft_symbols_are_as_soft_in_play():
     np.testing.assert_allclose(messages, jax.nn.softmax(net.encode[0](hidden) / 0.5)[None], rtol=1e-6)
 
 
-def test_symbols_that_are_soft_first_are_one_hot_at_a_temperature_of_0():
-    """Above it they are the soft ones. At 0 they are one-hot, with the soft gradient at .02, and so is the gate's."""
-    settings: dict[str, Any] = {"gate": True, "rounds": 2, "symbol_noise": 0.01}
-    first, soft, hard = (
-        talk("discrete", symbols=how, **settings) for how in ("soft_first", "soft", "straight_through")
-    )
-    hidden, near = jax.random.normal(jax.random.key(0), (3, 8)), Neighbourhood(EVERYONE, jnp.zeros((3, 3, 2)))
-
-    @eqx.filter_jit
-    def said(net: Any, temperature: float) -> tuple[Any, Any]:
-        net = eqx.tree_at(lambda net: net.encode, net, jax.tree.map(lambda weights: weights / 50, net.encode))
-        said = net.speak(hidden, near, jax.random.key(1), temperature)
-        slope = eqx.filter_grad(
-            lambda net: net.speak(hidden, near, jax.random.key(1), temperature).hidden[:, 0].sum()
-        )
-        return said.messages, jax.tree.leaves(slope(net))
-
-    for temperature in (0.02, 0.5):
-        jax.tree.map(np.testing.assert_array_equal, said(first, temperature), said(soft, temperature))
-    jax.tree.map(lambda *pair: np.testing.assert_allclose(*pair, atol=1e-6), said(first, 0.0), said(hard, 0.02))
-    assert np.abs(said(first, 0.0)[0] - said(soft, 0.02)[0]).max() > 0.1
-
-
 def test_every_weight_of_the_symbols_matters():
     """The receiver's too: what it knows decides whom it attends to."""
     net, key = talk("discrete", rounds=2), jax.random.key(1)

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int
 
 from gacrl.config.algorithms import LearningConfig
 from gacrl.config.checks import require
-from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.types import PRNGKey, Transition
 
 
@@ -30,7 +29,7 @@ class Level(NamedTuple):
     epsilon: Float[Array, ""] | float
     """Share of random actions."""
     temperature: Float[Array, ""] | float
-    """Of the Gumbel-Softmax messages; 0 where symbols that were soft at first are one-hot."""
+    """Of the Gumbel-Softmax messages."""
 
 
 class Exploration(NamedTuple):
@@ -47,21 +46,6 @@ class Exploration(NamedTuple):
     """(what the episode carries, key, ε) -> (the same, settled; the ε of this episode)."""
     moves: bool = True
     """False where the level is always the same: nobody then counts steps for it."""
-
-
-def rule_of(settings: LearningConfig, planned_steps: int, progress: str | None) -> Exploration:
-    """Make the rule that the settings name. Where symbols are soft first, their temperature is 0 after `soft_steps`."""
-    make: Callable[..., Exploration] = resolve(EXPLORATION[settings.exploration])
-    rule = make(settings, planned_steps, progress)
-    network = settings.network
-    if (network.communication, network.symbols) != ("discrete", "soft_first"):
-        return rule
-
-    def level(state: Any, env_steps: Int[Array, ""]) -> Level:
-        now = rule.level(state, env_steps)
-        return now._replace(temperature=jnp.where(env_steps < settings.soft_steps, now.temperature, 0.0))
-
-    return rule._replace(level=level, moves=True)
 
 
 def in_time(level: Callable[[Int[Array, ""]], Level], moves: bool = True) -> Exploration:

@@ -3,6 +3,7 @@
 Top to bottom: how agents act, targets, the loss, one update. MAPPO, IPPO and CommNet pass the view of their critic.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from gacrl.algorithms.actions import ActionSet
 from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.distributions import Distribution, distribution, explores
-from gacrl.algorithms.exploration import Exploration, Level, progress_between, rule_of
+from gacrl.algorithms.exploration import Exploration, Level, progress_between
 from gacrl.algorithms.objectives import (
     ValueNorm,
     clipped_surrogate,
@@ -29,6 +30,7 @@ from gacrl.algorithms.returns import generalised_advantages, n_step_returns, nex
 from gacrl.algorithms.shared import clipped_adam, mean_real, share_reward, sum_over_devices
 from gacrl.config.algorithms import NetworkConfig, PpoConfig
 from gacrl.config.checks import require
+from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, matched, unroll
@@ -123,6 +125,7 @@ def make(
     """
     family = distribution(env)
     _require_fit(config, env)
+    explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
     per_update = training.num_envs * training.num_steps
     p = Setup(
         config=config,
@@ -130,7 +133,7 @@ def make(
         distribution=family,
         settings=matched(env, config.network, family.actions.size),
         view=view,
-        explorer=rule_of(config, training.env_steps, progress),
+        explorer=explore(config, training.env_steps, progress),
         adam=clipped_adam(config.max_grad_norm, eps=1e-5),
         steps_per_update=per_update,
     )

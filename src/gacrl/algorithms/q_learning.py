@@ -19,13 +19,14 @@ from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import choices, greedy
 from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.exploration import progress_between, rule_of
+from gacrl.algorithms.exploration import Exploration, progress_between
 from gacrl.algorithms.objectives import ValueNorm, follow_returns, no_returns
 from gacrl.algorithms.q_learner import ActMemory, Experience, Hyper, LearnerState, Network, Parts, Setup
 from gacrl.algorithms.q_loss import loss
 from gacrl.algorithms.shared import clipped_adam, share_reward
 from gacrl.algorithms.teaching import told
 from gacrl.config.algorithms import QLearningConfig
+from gacrl.config.kinds import EXPLORATION, resolve
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.messages import interventions
@@ -38,13 +39,14 @@ def make(
     config: QLearningConfig, env: Environment, training: TrainingConfig, progress: str | None, parts: Parts
 ) -> Algorithm:
     """Make the learner for this task's shapes. progress: the measure that exploration may follow."""
+    explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
     network = eqx.filter_eval_shape(parts.networks, jax.random.key(0))
     q = Setup(
         config=config,
         env=env,
         actions=choices(env),
         parts=parts,
-        explorer=rule_of(config, training.env_steps, progress),
+        explorer=explore(config, training.env_steps, progress),
         adam=clipped_adam(config.max_grad_norm),
         num_envs=training.num_envs,
         num_steps=training.num_steps,

@@ -105,9 +105,8 @@ class NetworkConfig:
     """Rounds of messages within a step (CommNet, IC3Net, TarMAC, symbols)."""
     vocabulary: int = 8
     """Symbols of a message; units of a DIAL message."""
-    symbols: Literal["straight_through", "soft", "soft_first"] = "straight_through"
-    """Discrete symbols while learning: one-hot with the gradient of the soft sample, or soft, or soft for
-    algorithm.soft_steps and one-hot then; one-hot when played."""
+    symbols: Literal["straight_through", "soft"] = "straight_through"
+    """Discrete symbols while learning: one-hot with the gradient of the soft sample, or soft; one-hot when played."""
     symbol_noise: float = 1.0
     """Scale of the noise on symbols, and on their gate, while learning."""
     gate: bool = False
@@ -209,8 +208,6 @@ class LearningConfig:
     """And at the end, or when all is done."""
     exploration_steps: int = 50_000
     """Environment steps over which both fall, where they follow time."""
-    soft_steps: int = 200_000
-    """Environment steps for which algorithm.network.symbols soft_first are soft."""
     greedy_share: float = 0.2
     """Share of the training episodes that are played greedily, to see the progress that is made without exploring."""
     yoked_progress: tuple[float, ...] = ()
@@ -223,7 +220,7 @@ class LearningConfig:
         between("algorithm", self, 1e-6, 1e6, "max_grad_norm")
         between("algorithm", self, 0.0, 1.0, "epsilon", "epsilon_end", "greedy_share")
         between("algorithm", self, 0.01, 100.0, "temperature", "temperature_end")
-        between("algorithm", self, 0, 1_000_000_000, "exploration_steps", "soft_steps")
+        between("algorithm", self, 0, 1_000_000_000, "exploration_steps")
         rule = self.exploration
         require(rule in EXPLORATION, unknown("algorithm.exploration", rule, EXPLORATION))
         require(

@@ -20,11 +20,8 @@ def gumbel_softmax(
     sample.
     """
     soft = jax.nn.softmax((logits + noise) / temperature, axis=axis)
-    return as_one_hot(soft, axis) if straight_through else soft
-
-
-def as_one_hot(soft: Float[Array, "*b V"], axis: int = -1) -> Float[Array, "*b V"]:
-    """Return the one-hot of the largest entry, with the gradient of the soft sample."""
+    if not straight_through:
+        return soft
     return soft + jax.lax.stop_gradient(most_likely_symbol(soft, axis) - soft)
 
 

@@ -14,11 +14,8 @@ from gacrl.envs.environment import Environment
 from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, Weighed, received
 from gacrl.networks.graph import attend, attend_to_speakers, sighted, sighted_size
 from gacrl.networks.layers import Linear, Mlp, rectified
-from gacrl.networks.messages import as_one_hot, gumbel_sigmoid, gumbel_softmax, most_likely_symbol
+from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
 from gacrl.types import PRNGKey
-
-COLDEST = 0.02
-"""Temperature of the gradient where symbols that were soft are one-hot: that of `gacrl` at the end."""
 
 
 class Symbols(Communication):
@@ -44,7 +41,6 @@ class Symbols(Communication):
     noise: float = eqx.field(static=True)
     slope: float = eqx.field(static=True)
     straight_through: bool = eqx.field(static=True)
-    soft_first: bool = eqx.field(static=True)
     speaker_identity: bool = eqx.field(static=True)
 
     def __init__(self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None):
@@ -54,7 +50,6 @@ class Symbols(Communication):
         sizes = (first, *[width] * (config.rounds - 1))
         self.encode = tuple(Linear(i, symbols, k, gain) for i, k in zip(sizes, encode, strict=True))
         self.noise, self.straight_through = config.symbol_noise, config.symbols == "straight_through"
-        self.soft_first = config.symbols == "soft_first"
         self.speaker_identity = config.speaker_identity
         known = symbols + sighted_size(env) + env.num_agents * config.speaker_identity
         self.edge = tuple(Mlp(known, (narrow,), k, gain, config.heard_slope) for k in edge)
@@ -109,11 +104,7 @@ class Symbols(Communication):
         """Return who says a word in a round, 1 or 0, with the gradient of a soft choice."""
         logit = self.gate[number](meant)
         noise = None if key is None else self.noise * jax.random.logistic(jax.random.fold_in(key, 1), logit.shape)
-        return gumbel_sigmoid(logit, noise, self.warm(temperature))
-
-    def warm(self, temperature: Float[Array, ""] | float) -> Float[Array, ""] | float:
-        """Return the temperature that gradients are taken at. One of 0 says that symbols are one-hot by now."""
-        return jnp.maximum(temperature, COLDEST) if self.soft_first else temperature
+        return gumbel_sigmoid(logit, noise, temperature)
 
     def drawn(self, key: PRNGKey, logits: Float[Array, "N V"]) -> Float[Array, "N V"]:
         """Draw the Gumbel noise of a round."""
@@ -130,9 +121,8 @@ class Symbols(Communication):
 class DiscreteSymbols(Symbols):
     """Symbols that are one-hot when played, the most likely ones.
 
-    While learning they are one-hot as well, with the gradient of the soft sample, or soft, or soft at first. (A one-hot
-    sample is drawn the same way at every temperature: only soft ones grow sharper as it falls, and are heard before
-    they are sharp. But whoever learns for long finds meanings for their mixtures, which nobody hears in play.)
+    While learning they are one-hot as well, with the gradient of the soft sample, or soft. (A one-hot sample is drawn
+    the same way at every temperature: only soft ones grow sharper as it falls, and are heard before they are sharp.)
     """
 
     sends_symbols: ClassVar[bool] = True
@@ -142,8 +132,7 @@ class DiscreteSymbols(Symbols):
     ) -> Float[Array, "N V"]:
         if key is None:
             return most_likely_symbol(logits)
-        said = gumbel_softmax(logits, self.drawn(key, logits), self.warm(temperature), self.straight_through)
-        return jnp.where(temperature > 0, said, as_one_hot(said)) if self.soft_first else said
+        return gumbel_softmax(logits, self.drawn(key, logits), temperature, self.straight_through)
 
 
 class SoftSymbols(Symbols):
