@@ -239,6 +239,7 @@ TRAFFIC = {
     "today's, 2,000,000 steps": "talk-traffic-easy-2m-3-seeds",
     "γ .95 and 100 environments": "talk-traffic-easy-100-environments-3-seeds",
     "the same and 64 units": "talk-traffic-easy-64-units-3-seeds",
+    "the same without a price on logits": "talk-traffic-easy-no-price-3-seeds",
 }
 SOLVES, TALK = "GACRL that solves the task", "Tasks that need talk"
 IN_MPE2 = "gacrl-10-seeds-mpe2"
