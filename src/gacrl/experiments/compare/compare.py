@@ -85,7 +85,7 @@ class Pair(NamedTuple):
 
     @property
     def verdict(self) -> str | None:
-        """Of a against b. Fewer than five seeds are told apart by chance too often to say so."""
+        """Return the verdict of a against b. Fewer than five seeds are told apart by chance too often to say so."""
         if self.difference is None:
             return None
         apart = self.difference.verdict != "cannot be told apart"
@@ -260,7 +260,7 @@ def _is_switch(name: str, values: Sequence[Any]) -> bool:
 
 
 def _cautions(groups: Sequence[Group], differences: Mapping[str, tuple[Any, ...]]) -> Iterator[str]:
-    """What weakens every sentence about these groups."""
+    """Yield what weakens every sentence about these groups."""
     switches = {name: values for name, values in differences.items() if _is_switch(name, values)}
     if switches:
         told = "; ".join(f"{name}: {' | '.join(map(show, values))}" for name, values in switches.items())
