@@ -234,6 +234,11 @@ MEDIUM = {
     "vision 0": "talk-traffic-medium-5m-3-seeds",
 }
 TRAFFIC = {
+    "longer exploration and replay": "talk-traffic-easy-fresh-3-seeds",
+    "the same, silenced": "talk-traffic-easy-fresh-silenced",
+    "the same, scrambled": "talk-traffic-easy-fresh-scrambled",
+    "the same, seeds 0 to 2": "talk-traffic-easy-replay-3-seeds",
+    "longer exploration alone": "talk-traffic-easy-250-environments-3-seeds",
     "values of before, 800,000 steps": "talk-traffic-easy-3-seeds",
     "today's, 800,000 steps": "talk-traffic-easy-800k-3-seeds",
     "today's, 2,000,000 steps": "talk-traffic-easy-2m-3-seeds",
