@@ -147,8 +147,8 @@ def _notes(config: RunConfig) -> Iterator[str]:
     task, rule = tasks.find(config.task), getattr(config.algorithm, "exploration", None)
     if rule == "adaptive" and task.progress is None:
         yield (
-            f"exploration falls linearly over {config.algorithm.exploration_steps:,} steps: {task.name} does not say "
-            "what progress is"
+            f"exploration falls linearly over {config.algorithm.exploration_steps:,} steps "
+            f"(--algorithm.exploration-steps): {task.name} does not say what progress is"
         )
 
 
