@@ -232,6 +232,7 @@ MEDIUM = {
     "vision 1, 100 environments": "talk-traffic-medium-vision1-2m-3-seeds",
     "the same, silenced": "talk-traffic-medium-vision1-2m-silenced",
     "vision 0": "talk-traffic-medium-5m-3-seeds",
+    "the same with 200 environments": "talk-traffic-medium-exploring-2-seeds",
 }
 TRAFFIC = {
     "longer exploration and replay": "talk-traffic-easy-fresh-3-seeds",
