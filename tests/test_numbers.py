@@ -235,10 +235,10 @@ MEDIUM = {
     "the same with 200 environments": "talk-traffic-medium-exploring-2-seeds",
 }
 TRAFFIC = {
-    "longer exploration and replay": "talk-traffic-easy-fresh-3-seeds",
+    "longer exploration and replay, fresh": "talk-traffic-easy-fresh-3-seeds",
     "the same, silenced": "talk-traffic-easy-fresh-silenced",
     "the same, scrambled": "talk-traffic-easy-fresh-scrambled",
-    "the same, seeds 0 to 2": "talk-traffic-easy-replay-3-seeds",
+    "longer exploration and replay, seeds": "talk-traffic-easy-replay-3-seeds",
     "longer exploration alone": "talk-traffic-easy-250-environments-3-seeds",
     "values of before, 800,000 steps": "talk-traffic-easy-3-seeds",
     "today's, 800,000 steps": "talk-traffic-easy-800k-3-seeds",
