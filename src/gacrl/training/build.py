@@ -1,4 +1,4 @@
-"""What a run is made of, from its settings: the task, the algorithm, the trainer, and what it will take."""
+"""Build what a run is made of, from its settings: the task, the algorithm, the trainer, and what it will take."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from gacrl.types import Intervention, Learner
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run is going to be: known before anything is allocated or compiled."""
+    """Tell what a run is going to be, before anything is allocated or compiled."""
 
     parameters: int
     """Numbers that a seed's network learns."""
@@ -88,7 +88,7 @@ def make_trainer(
 
 
 def _over(crew: Crew, env: Environment, task: Task) -> Hosted:
-    """The same environment, over processes. Raises ConfigError for one that is compiled."""
+    """Return the same environment, over processes. Raises ConfigError for one that is compiled."""
     if not isinstance(env, Hosted):
         raise ConfigError(
             f"training.env_processes {crew.size} is for environments that live in Python, and {task.name} is compiled: "
