@@ -122,7 +122,8 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
     team = case.mixer != "iql"
     if case.reward_norm:  # one step of the running moments: the batch's own
         earned = reward[:, REAL]
-        reward = (reward[:, REAL] - earned.mean()) / earned.std()
+        mean = 0.0 if case.lives and not team else earned.mean()  # or it would pay for a longer life
+        reward = (reward[:, REAL] - mean) / earned.std()
         reward = np.concatenate([reward, np.zeros((len(reward), 1))], axis=1)
     left = np.zeros((len(here), N), bool) if steps.left is None else steps.left
     carry, errors = np.full(N, 2.0), []
@@ -165,6 +166,7 @@ CASES = {
         "vdn", 3, 4, True, time_limits=(0, 2, 3), unknown=3
     ),
     "IQL, lives end inside the episode": Case("iql", 3, 4, False, lives=True),
+    "IQL, normed, lives end inside the episode": Case("iql", 3, 4, False, reward_norm=True, lives=True),
     "IQL, recurrent, lives end inside the episode": Case("iql", 3, 4, True, lives=True),
     "VDN, recurrent, lives end inside the episode": Case("vdn", 3, 4, True, lives=True),
 }

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.contract import Algorithm
+from gacrl.algorithms.iql import independent
 from gacrl.algorithms.q_learner import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
 from gacrl.algorithms.vdn import summed
@@ -41,10 +42,31 @@ def central(
 ) -> Float[Array, "1"]:
     """Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)]: the critic of (12), and what each agent falls short of it."""
     layers, head = network.team
-    available = jnp.where(actions.mask(observation.action_mask), output.head, -jnp.inf)
-    shortfall = taken(output.head, action) - available.max(-1)
+    lost = shortfall(actions, output, action, observation)
     value = head(layers(team_mean(output.hidden, observation)))
-    return value + jnp.where(observation.agent_mask, shortfall, 0.0).sum()
+    return value + jnp.where(observation.agent_mask, lost, 0.0).sum()
+
+
+def individual(
+    actions: ActionSet,
+    network: Network,
+    output: AgentOutput,
+    action: Int[Array, " N"],
+    observation: Observation,
+) -> Float[Array, " N"]:
+    """Q_i = V_i(s) + A_i(a_i) − max_a A_i(a) of each agent's own reward; V_i sees its agent's vector beside all."""
+    layers, head = network.team
+    everyone = jnp.broadcast_to(team_mean(output.hidden, observation), output.hidden.shape)
+    value = head(layers(jnp.concatenate([output.hidden, everyone], axis=-1)))[:, 0]
+    return value + shortfall(actions, output, action, observation)
+
+
+def shortfall(
+    actions: ActionSet, output: AgentOutput, action: Int[Array, " N"], observation: Observation
+) -> Float[Array, " N"]:
+    """A_i(a_i) − max_a A_i(a): what each agent's action loses against its best available one."""
+    available = jnp.where(actions.mask(observation.action_mask), output.head, -jnp.inf)
+    return taken(output.head, action) - available.max(-1)
 
 
 def make(
@@ -53,7 +75,7 @@ def make(
     """Make the learner for this task's shapes. progress: the task's measure that exploration follows."""
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
-    width = settings.width
+    width, own = settings.width, config.reward == "own"
     told = replace(settings, communication="told", latent="none", gate=False, word_price=0.0)
 
     def networks(key: PRNGKey) -> Network:
@@ -66,7 +88,7 @@ def make(
         )
         if config.critic == "sum":
             return Network(agent, ())
-        value = (Mlp(width, (width,), layers_key), Linear(width, 1, head_key))
+        value = (Mlp(width * (1 + own), (width,), layers_key), Linear(width, 1, head_key))
         if config.critic == "central":
             return Network(agent, value)
         return Network(agent, value, AgentNetwork(env, told, actions.size, jax.random.fold_in(key, 1)))
@@ -77,10 +99,10 @@ def make(
         code = {"loss_code": config.latent_weight * jnp.mean(output.code_loss)}
         return {**code, **message_loss(output, observation)}
 
-    parts = Parts(
-        networks=networks,
-        team_value=summed if config.critic == "sum" else partial(central, actions),
-        auxiliary=auxiliary,
-    )
+    if config.critic == "sum":
+        value = independent if own else summed
+    else:
+        value = partial(individual if own else central, actions)
+    parts = Parts(networks, value, own_values=own, auxiliary=auxiliary)
     learner = q_learning.make(config, env, training, progress, parts)
     return learner._replace(compiled_for_speed=False)  # as quick when quickly compiled (docs/design.md)

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.algorithms.actions import greedy
 from gacrl.algorithms.objectives import HUBER_DELTA, ValueNorm, huber
 from gacrl.algorithms.q_learner import Experience, LearnerState, Network, Setup
-from gacrl.algorithms.returns import n_step_returns, n_step_window, next_values
+from gacrl.algorithms.returns import n_step_window, next_values
 from gacrl.algorithms.shared import share_reward
 from gacrl.algorithms.teaching import as_told, lesson
 from gacrl.networks.agent import AgentNetwork, AgentOutput, unroll
@@ -125,10 +125,8 @@ def window_loss(
     else:
         future = following(q, pair, seen, looks.online, looks.theirs)[ends.at]
     value = jax.vmap(lambda *now: q.parts.team_value(network, *now))(online, now.decision.action, now.observation)
-    shared = q.config.reward == "team" or not q.parts.own_values  # the team's value is learned from its reward
-    reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
-    reward = rewards.normalise(reward)[:, : value.shape[-1]]
-    error = value - jax.lax.stop_gradient(window_targets(q, seen, reward, future, ends, gamma))
+    reward = team_or_own(q, rewards, seen)[:, : value.shape[-1]]
+    error = value - jax.lax.stop_gradient(window_targets(q, reward, future, ends, gamma))
     real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
     auxiliary = {}
@@ -142,44 +140,47 @@ def window_loss(
     return td + sum(auxiliary.values(), jnp.zeros(())), metrics
 
 
-class Ends(NamedTuple):
-    """Where the targets of a window's learned steps bootstrap."""
+def team_or_own(q: Setup, rewards: ValueNorm, seen: Transition) -> Float[Array, "W N"]:
+    """Return the rewards to learn from: the team's for everyone, or each agent's own.
 
-    weight: Float[Array, "n W"] | None
-    """Which of the n steps from each on belong to its target; None where agents' lives have ends of their own."""
-    at: Int[Array, " at"]
-    """Steps after which a value is needed: the last of each target, or every step."""
+    In units of their standard deviation; from their mean as well, unless lives end inside episodes. There it would pay
+    agents for every step that they stay, or fine them for it.
+    """
+    shared = q.config.reward == "team" or not q.parts.own_values  # the team's value is learned from its reward
+    reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
+    return reward / rewards.sd if q.parts.own_values and seen.left is not None else rewards.normalise(reward)
+
+
+class Ends(NamedTuple):
+    """Where the targets of a window's learned steps end."""
+
+    weight: Float[Array, "n W #M"]
+    """Which of the n steps from each on belong to its target."""
+    over: Bool[Array, "L #M"]
+    """Whether nothing follows the target's last step: the task, or an agent's life, has ended."""
+    at: Int[Array, " L"]
+    """The step after which the target bootstraps, unless it is over."""
 
 
 def window_ends(q: Setup, seen: Transition) -> Ends:
-    """Return the ends of each learned step's target; where each agent's value is learned and lives end inside episodes,
-    of every step.
-    """
+    """Return the ends of each learned step's target: one for the team, or one for each agent's life."""
+    learned, n = q.config.sequence_length, q.config.n_step
+    at = n_step_window(seen.terminated | seen.truncated, n)[1][:learned]
+    over = seen.terminated[:, None]
     if q.parts.own_values and seen.left is not None:
-        return Ends(None, jnp.arange(q.window))
-    weight, last = n_step_window(seen.terminated | seen.truncated, q.config.n_step)
-    return Ends(weight, last[: q.config.sequence_length])
+        over |= seen.left
+    weight, last = n_step_window(over | seen.truncated[:, None], n)
+    return Ends(weight, jnp.take_along_axis(over, last, axis=0)[:learned], at)
 
 
 def window_targets(
-    q: Setup,
-    seen: Transition,
-    reward: Float[Array, "W M"],
-    future: Float[Array, "at M"],
-    ends: Ends,
-    gamma: Float[Array, ""] | float,
+    q: Setup, reward: Float[Array, "W M"], future: Float[Array, "L M"], ends: Ends, gamma: Float[Array, ""] | float
 ) -> Float[Array, "L M"]:
     """n rewards and then the value that followed; fewer rewards where the episode, or a life of its own, ends."""
     learned, n = q.config.sequence_length, q.config.n_step
-    if ends.weight is None:
-        assert seen.left is not None
-        over = seen.terminated[:, None] | seen.left
-        cut = jnp.broadcast_to(seen.truncated[:, None], over.shape)
-        return n_step_returns(reward, future, over, cut, gamma, n)[:learned]
-    earned = sum(gamma**k * ends.weight[k, :learned, None] * reward[k : k + learned] for k in range(n))
+    earned = sum(gamma**k * ends.weight[k, :learned] * reward[k : k + learned] for k in range(n))
     length = ends.at - jnp.arange(learned) + 1
-    discount = gamma ** length[:, None] * ~seen.terminated[ends.at][:, None]
-    return earned + discount * future
+    return earned + gamma ** length[:, None] * ~ends.over * future
 
 
 def loss(
