@@ -75,6 +75,21 @@ def test_an_agents_own_value_is_its_critics_less_what_it_falls_short_itself():
     np.testing.assert_allclose(found, value - short * (np.arange(4) == 1), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("critic", ["told", "central", "sum"])
+@pytest.mark.parametrize("reward", ["team", "own"])
+def test_a_team_has_one_value_and_own_rewards_one_for_each_agent(critic: Any, reward: Any):
+    algorithm = algorithms.make(replace(SMALL, critic=critic, reward=reward), ENV, TRAINING)
+    parts = algorithm.init.args[0].parts  # pyright: ignore[reportFunctionMemberAccess] a partial
+
+    def value() -> Any:
+        _, seen = ENV.reset(jax.random.key(0))
+        network = parts.networks(jax.random.key(1))
+        return parts.team_value(network, network.judge(seen)[0], jnp.zeros(4, jnp.int32), seen)
+
+    assert parts.own_values == (reward == "own")
+    assert jax.eval_shape(value).shape == ((4,) if reward == "own" else (1,))
+
+
 TAUGHT = replace(SMALL, critic="told", averaged=False, network=replace(TALKING, latent="none"))
 
 

@@ -5,7 +5,8 @@
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
   learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
   actions stays each agent's own argmax, so that execution is decentralised. With `critic told` the agents of Q_tot are
-  for training only as well: they are told what the others see, and teach those who act and talk.
+  for training only as well: they are told what the others see, and teach those who act and talk. With `reward own`
+  each agent has such a value of its own, learned from its own reward.
 - Exploration that adapts to progress, on `spread` coverage, (13) to (16): `exploration.adaptive`.
 """
 
@@ -88,7 +89,7 @@ def make(
         )
         if config.critic == "sum":
             return Network(agent, ())
-        value = (Mlp(width * (1 + own), (width,), layers_key), Linear(width, 1, head_key))
+        value = (Mlp(2 * width if own else width, (width,), layers_key), Linear(width, 1, head_key))
         if config.critic == "central":
             return Network(agent, value)
         return Network(agent, value, AgentNetwork(env, told, actions.size, jax.random.fold_in(key, 1)))
@@ -100,9 +101,9 @@ def make(
         return {**code, **message_loss(output, observation)}
 
     if config.critic == "sum":
-        value = independent if own else summed
+        team_value = independent if own else summed
     else:
-        value = partial(individual if own else central, actions)
-    parts = Parts(networks, value, own_values=own, auxiliary=auxiliary)
+        team_value = partial(individual if own else central, actions)
+    parts = Parts(networks, team_value, own_values=own, auxiliary=auxiliary)
     learner = q_learning.make(config, env, training, progress, parts)
     return learner._replace(compiled_for_speed=False)  # as quick when quickly compiled (docs/design.md)

@@ -31,7 +31,7 @@ class Pair(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """What networks make of windows: what they put out, and their memory after each step."""
+    """Hold what networks make of windows: what they put out, and their memory after each step."""
 
     online: tuple[AgentOutput, Memory]
     """Of the network that learns from rewards; without a memory, of the steps that are learned from."""
@@ -143,8 +143,8 @@ def window_loss(
 def team_or_own(q: Setup, rewards: ValueNorm, seen: Transition) -> Float[Array, "W N"]:
     """Return the rewards to learn from: the team's for everyone, or each agent's own.
 
-    In units of their standard deviation; from their mean as well, unless lives end inside episodes. There it would pay
-    agents for every step that they stay, or fine them for it.
+    They are scaled by the running standard deviation. The mean is taken off as well, but not from own rewards where
+    lives end inside episodes: there it would pay, or fine, agents for every step that they stay.
     """
     shared = q.config.reward == "team" or not q.parts.own_values  # the team's value is learned from its reward
     reward = share_reward(seen.reward, seen.observation.agent_mask, shared)

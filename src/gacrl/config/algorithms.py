@@ -170,7 +170,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class LearningConfig:
-    """What every learner has: its network, its horizon, its step size, and the symmetry of the task."""
+    """Set what every learner has: its network, its horizon, its step size, and the symmetry of the task."""
 
     learns_code: ClassVar[bool] = False
     """Whether there is a loss for the network's code."""
