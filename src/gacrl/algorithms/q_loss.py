@@ -164,13 +164,13 @@ class Ends(NamedTuple):
 
 def window_ends(q: Setup, seen: Transition) -> Ends:
     """Return the ends of each learned step's target: one for the team, or one for each agent's life."""
-    learned, n = q.config.sequence_length, q.config.n_step
-    at = n_step_window(seen.terminated | seen.truncated, n)[1][:learned]
+    learned = q.config.sequence_length
     over = seen.terminated[:, None]
     if q.parts.own_values and seen.left is not None:
         over |= seen.left
-    weight, last = n_step_window(over | seen.truncated[:, None], n)
-    return Ends(weight, jnp.take_along_axis(over, last, axis=0)[:learned], at)
+    weight, last = n_step_window(over | seen.truncated[:, None], q.config.n_step)
+    over = jnp.take_along_axis(over, last, axis=0, mode="clip")
+    return Ends(weight, over[:learned], last[:learned].max(-1))  # a life that ends sooner needs no value
 
 
 def window_targets(

@@ -80,11 +80,11 @@ def n_step_window(done: Bool[Array, "T *b"], n: int) -> tuple[Float[Array, "n T 
     """Return which of the n steps from each t on belong to its return (1 or 0), and the index of the last that does."""
     length = done.shape[0]
     time = jnp.broadcast_to(jnp.arange(length).reshape(-1, *[1] * (done.ndim - 1)), done.shape)
+    ahead = jnp.pad(done, [(0, n), *[(0, 0)] * (done.ndim - 1)])
     alive, last, weights = jnp.ones(done.shape, bool), time, []
     for k in range(n):
-        later = jnp.minimum(time + k, length - 1)
         alive &= time + k < length
         weights.append(alive.astype(float))
-        last = jnp.where(alive, later, last)
-        alive &= ~jnp.take_along_axis(done, later, axis=0)
+        last = jnp.where(alive, time + k, last)
+        alive &= ~ahead[k : k + length]
     return jnp.stack(weights), last
