@@ -9,11 +9,12 @@ from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.networks.arrives import arriving
+from gacrl.networks.graph import sighted
+from gacrl.networks.layers import Mlp
 from gacrl.types import Arrives, PRNGKey
 
 
@@ -43,13 +44,6 @@ class Neighbourhood(NamedTuple):
         if self.speakers is not None:
             return words[self.speakers]
         return jnp.broadcast_to(words[None], (words.shape[0], *words.shape))
-
-    def who(self) -> Float[Array, "N K N"]:
-        """Return who each agent's speakers are, as one-hots."""
-        num_agents, count = self.adjacency.shape
-        if self.speakers is not None:
-            return jax.nn.one_hot(self.speakers, num_agents)
-        return jnp.broadcast_to(jnp.eye(num_agents), (num_agents, count, num_agents))
 
 
 class Weighed(NamedTuple):
@@ -115,6 +109,26 @@ def received(
 ) -> Float[Array, "N K V"]:
     """Return what each agent receives of its speakers in round `number` (from 0) of so many."""
     return near.hear(arriving(words, near.arrives, number, rounds))
+
+
+def embedded(
+    layers: Mlp,
+    words: Float[Array, "N V"],
+    near: Neighbourhood,
+    number: int = 0,
+    rounds: int = 1,
+    who: bool = False,
+) -> Float[Array, "N K H"]:
+    """Embed what each agent receives of its speakers beside what it sees of them; who: and beside who they are.
+
+    Where agents do not see each other, all hear the same of a speaker: it is embedded once, not for every listener.
+    """
+    said = arriving(words, near.arrives, number, rounds)
+    names = [jnp.eye(len(said))] if who else []
+    if not near.sight.shape[-1]:
+        return near.hear(layers(jnp.concatenate([said, *names], axis=-1)))
+    parts = [near.hear(said), sighted(near.sight), *map(near.hear, names)]
+    return layers(jnp.concatenate(parts, axis=-1))
 
 
 def neighbour_mean(received: Float[Array, "N K V"], adjacency: Bool[Array, "N K"]) -> Float[Array, "N V"]:

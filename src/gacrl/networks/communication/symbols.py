@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, Weighed, received
-from gacrl.networks.graph import attend, attend_to_speakers, sighted, sighted_size
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, Weighed, embedded, received
+from gacrl.networks.graph import attend, attend_to_speakers, sighted_size
 from gacrl.networks.layers import Linear, Mlp, rectified
 from gacrl.networks.messages import gumbel_sigmoid, gumbel_softmax, most_likely_symbol
 from gacrl.types import PRNGKey
@@ -67,13 +67,11 @@ class Symbols(Communication):
         temperature: Float[Array, ""] | float,
         code: Float[Array, "N Z"] | None = None,
     ) -> Spoken:
-        known, said = [sighted(near.sight)], []
+        said: list[Array] = []
         squares = jnp.zeros(hidden.shape[0])
         could_say: list[Array] = []
         scores: list[Array] = []
         rounds = len(self.encode)
-        if self.speaker_identity:
-            known.append(near.who())
         for number, (encode, edge, query, merge) in enumerate(
             zip(self.encode, self.edge, self.query, self.merge, strict=True)
         ):
@@ -85,11 +83,13 @@ class Symbols(Communication):
             said.append(self.symbol(logits, draw, temperature))
             if self.gate:
                 said[-1] *= self.spoke(meant, number, draw, temperature)
-            words = received(said[-1], near, number, rounds)
-            edges_heard = edge(jnp.concatenate([words, *known], axis=-1))
+            edges_heard = embedded(edge, said[-1], near, number, rounds, self.speaker_identity)
             score = jnp.einsum("nh,nkh->nk", query(hidden), edges_heard) / math.sqrt(edges_heard.shape[-1])
             heeded = edges_heard, jnp.where(near.adjacency, score, -jnp.inf)
-            heard = attend_to_speakers(*heeded, words.sum(-1)) if self.gate else attend(*heeded)
+            if self.gate:
+                heard = attend_to_speakers(*heeded, received(said[-1], near, number, rounds).sum(-1))
+            else:
+                heard = attend(*heeded)
             scores.append(heeded[1])
             hidden = hidden + rectified(merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
         messages = jnp.stack(said)

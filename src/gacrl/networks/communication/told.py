@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from gacrl.config.algorithms import NetworkConfig
 from gacrl.envs.environment import Environment
-from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, received
-from gacrl.networks.graph import attend, sighted, sighted_size
+from gacrl.networks.communication.base import Communication, Neighbourhood, Spoken, embedded
+from gacrl.networks.graph import attend, sighted_size
 from gacrl.networks.layers import Linear, Mlp, rectified
 from gacrl.types import PRNGKey
 
@@ -42,8 +42,7 @@ class Told(Communication):
     def hear(
         self, hidden: Float[Array, "N H"], inbox: Any, near: Neighbourhood, key: PRNGKey | None
     ) -> Float[Array, "N H"]:
-        told = received(near.observed(), near)
-        edges = self.edge(jnp.concatenate([told, sighted(near.sight), near.who()], axis=-1))
+        edges = embedded(self.edge, near.observed(), near, who=True)
         score = jnp.einsum("nh,nkh->nk", self.query(hidden), edges) / math.sqrt(edges.shape[-1])
         heard = attend(edges, jnp.where(near.adjacency, score, -jnp.inf))
         return hidden + rectified(self.merge(jnp.concatenate([hidden, heard], axis=-1)), self.slope)
