@@ -19,6 +19,7 @@ from gacrl.algorithms.objectives import clipped_surrogate, follow_returns, huber
 from gacrl.algorithms.shared import mean_real, share_reward
 from gacrl.config.algorithms import IppoConfig, MappoConfig, NetworkConfig
 from gacrl.config.run import TrainingConfig
+from gacrl.envs.environment import observe
 from gacrl.envs.probes import Probe
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Decision, Rollout, Transition
@@ -77,10 +78,14 @@ def test_value_norm_by_hand():
 
 
 def test_rewards_and_means_are_those_of_real_agents():
-    reward, real = jnp.array([[1.0, 2.0, 30.0]]), jnp.array([[True, True, False]])
-    np.testing.assert_array_equal(share_reward(reward, real, True), [[1.5, 1.5, 1.5]])
-    np.testing.assert_array_equal(share_reward(reward, real, False), reward)
+    reward, real, no = jnp.array([1.0, 2.0, 30.0]), jnp.array([True, True, False]), jnp.zeros((), bool)
+    seen = observe(jnp.zeros((3, 1)), num_actions=2, alive=real)
+    steps = Transition(seen, Decision(jnp.zeros(3, jnp.int32)), reward, no, no, no, seen, {})
+    np.testing.assert_array_equal(share_reward(steps, True), [1.5, 1.5, 1.5])
+    np.testing.assert_array_equal(share_reward(steps, False), reward)
     assert mean_real(reward, real) == 1.5
+    come_and_go = steps._replace(left=jnp.zeros(3, bool))
+    np.testing.assert_array_equal(share_reward(come_and_go, True), [1.0, 1.0, 1.0], "who is away earns 0")
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 1600, 2**16, 2**16 + 1])

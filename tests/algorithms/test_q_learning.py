@@ -121,7 +121,7 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
     reward = np.asarray(steps.reward, float)
     team = case.mixer != "iql"
     if case.reward_norm:  # one step of the running moments: the batch's own
-        earned = reward[:, REAL]
+        earned = reward[:, REAL].mean(1) if team else reward[:, REAL]
         mean = 0.0 if case.lives and not team else earned.mean()  # or it would pay for a longer life
         reward = (reward[:, REAL] - mean) / earned.std()
         reward = np.concatenate([reward, np.zeros((len(reward), 1))], axis=1)
@@ -136,7 +136,8 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
     for t in range(case.learned):
         total, k, alive = np.zeros(N), 0, np.ones(N, bool)
         while True:
-            shared = np.full(N, reward[t + k][REAL].mean()) if team else reward[t + k]
+            among = N if case.lives else REAL.sum()  # those who come and go share with empty slots
+            shared = np.full(N, reward[t + k][REAL].sum() / among) if team else reward[t + k]
             total += np.where(alive, GAMMA**k * shared, 0.0)
             alive &= ~left[t + k] | team  # the team lives on
             last = t + k

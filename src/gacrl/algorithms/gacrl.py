@@ -5,8 +5,7 @@
 - The central critic (12) is used: Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)] of the joint action is
   learned from replay by Q-learning. V sees all agents and is for training only; the maximum over joint
   actions stays each agent's own argmax, so that execution is decentralised. With `critic told` the agents of Q_tot are
-  for training only as well: they are told what the others see, and teach those who act and talk. With `reward own`
-  each agent has such a value of its own, learned from its own reward.
+  for training only as well: they are told what the others see, and teach those who act and talk.
 - Exploration that adapts to progress, on `spread` coverage, (13) to (16): `exploration.adaptive`.
 """
 
@@ -20,7 +19,6 @@ from jaxtyping import Array, Float, Int
 from gacrl.algorithms import q_learning
 from gacrl.algorithms.actions import ActionSet, choices
 from gacrl.algorithms.contract import Algorithm
-from gacrl.algorithms.iql import independent
 from gacrl.algorithms.q_learner import Network, Parts, message_loss
 from gacrl.algorithms.shared import taken
 from gacrl.algorithms.vdn import summed
@@ -33,6 +31,9 @@ from gacrl.networks.critic import team_mean
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.types import Metrics, Observation, PRNGKey
 
+LONG = 1_000_000
+"""Environment steps of a training from which on it pays to compile for speed (docs/design.md)."""
+
 
 def central(
     actions: ActionSet,
@@ -43,31 +44,10 @@ def central(
 ) -> Float[Array, "1"]:
     """Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)]: the critic of (12), and what each agent falls short of it."""
     layers, head = network.team
-    lost = shortfall(actions, output, action, observation)
-    value = head(layers(team_mean(output.hidden, observation)))
-    return value + jnp.where(observation.agent_mask, lost, 0.0).sum()
-
-
-def individual(
-    actions: ActionSet,
-    network: Network,
-    output: AgentOutput,
-    action: Int[Array, " N"],
-    observation: Observation,
-) -> Float[Array, " N"]:
-    """Q_i = V_i(s) + A_i(a_i) − max_a A_i(a) of each agent's own reward; V_i sees its agent's vector beside all."""
-    layers, head = network.team
-    everyone = jnp.broadcast_to(team_mean(output.hidden, observation), output.hidden.shape)
-    value = head(layers(jnp.concatenate([output.hidden, everyone], axis=-1)))[:, 0]
-    return value + shortfall(actions, output, action, observation)
-
-
-def shortfall(
-    actions: ActionSet, output: AgentOutput, action: Int[Array, " N"], observation: Observation
-) -> Float[Array, " N"]:
-    """A_i(a_i) − max_a A_i(a): what each agent's action loses against its best available one."""
     available = jnp.where(actions.mask(observation.action_mask), output.head, -jnp.inf)
-    return taken(output.head, action) - available.max(-1)
+    shortfall = taken(output.head, action) - available.max(-1)
+    value = head(layers(team_mean(output.hidden, observation)))
+    return value + jnp.where(observation.agent_mask, shortfall, 0.0).sum()
 
 
 def make(
@@ -76,7 +56,7 @@ def make(
     """Make the learner for this task's shapes. progress: the task's measure that exploration follows."""
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
-    width, own = settings.width, config.reward == "own"
+    width = settings.width
     told = replace(settings, communication="told", latent="none", gate=False, word_price=0.0)
 
     def networks(key: PRNGKey) -> Network:
@@ -89,7 +69,7 @@ def make(
         )
         if config.critic == "sum":
             return Network(agent, ())
-        value = (Mlp(2 * width if own else width, (width,), layers_key), Linear(width, 1, head_key))
+        value = (Mlp(width, (width,), layers_key), Linear(width, 1, head_key))
         if config.critic == "central":
             return Network(agent, value)
         return Network(agent, value, AgentNetwork(env, told, actions.size, jax.random.fold_in(key, 1)))
@@ -100,10 +80,10 @@ def make(
         code = {"loss_code": config.latent_weight * jnp.mean(output.code_loss)}
         return {**code, **message_loss(output, observation)}
 
-    if config.critic == "sum":
-        team_value = independent if own else summed
-    else:
-        team_value = partial(individual if own else central, actions)
-    parts = Parts(networks, team_value, own_values=own, auxiliary=auxiliary)
+    parts = Parts(
+        networks=networks,
+        team_value=summed if config.critic == "sum" else partial(central, actions),
+        auxiliary=auxiliary,
+    )
     learner = q_learning.make(config, env, training, progress, parts)
-    return learner._replace(compiled_for_speed=False)  # as quick when quickly compiled (docs/design.md)
+    return learner._replace(compiled_for_speed=training.env_steps >= LONG)

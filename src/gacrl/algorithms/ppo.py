@@ -275,7 +275,7 @@ def targets(
         return next_values(value, steps.truncated, p.env.shortest_truncated, anew)
 
     next_value = jax.vmap(after, (1, 0, 1), 1)(steps, memory.critic, value)
-    reward = share_reward(steps.reward, steps.observation.agent_mask, p.config.reward == "team")
+    reward = share_reward(steps, p.config.reward == "team")
     ends = (steps.terminated[..., None], steps.truncated[..., None])
     terminated, truncated = (jnp.broadcast_to(end, reward.shape) for end in ends)
     if steps.left is not None:

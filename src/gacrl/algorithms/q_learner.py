@@ -87,6 +87,11 @@ class Setup:
         return max(rollouts, -(-self.window // self.num_steps)) * self.num_steps
 
     @property
+    def shares_reward(self) -> bool:
+        """Everyone earns the team's reward: a value of the team can be learned from no other."""
+        return self.config.reward == "team" or not self.parts.own_values
+
+    @property
     def forgetful(self) -> bool:
         """The network has no memory."""
         return not jax.tree.leaves(self.fresh)

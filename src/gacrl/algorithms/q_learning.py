@@ -194,7 +194,7 @@ def remember(q: Setup, learner: LearnerState, steps: Transition) -> LearnerState
     replay = ring.add_block(learner.replay, jax.vmap(jax.vmap(ring.pack))(block))
     rewards = learner.rewards
     if q.config.reward_norm:
-        earned = share_reward(steps.reward, steps.observation.agent_mask, q.config.reward == "team")
+        earned = share_reward(steps, q.shares_reward)
         rewards = follow_returns(rewards, earned, steps.observation.agent_mask)
     env_steps = learner.env_steps + q.num_envs * q.num_steps
     exploration = q.explorer.follow(learner.exploration, steps)

@@ -143,11 +143,10 @@ def window_loss(
 def team_or_own(q: Setup, rewards: ValueNorm, seen: Transition) -> Float[Array, "W N"]:
     """Return the rewards to learn from: the team's for everyone, or each agent's own.
 
-    They are scaled by the running standard deviation. The mean is taken off as well, but not from own rewards where
-    lives end inside episodes: there it would pay, or fine, agents for every step that they stay.
+    They are scaled by the running standard deviation. The mean is taken off as well, but not where an agent's value
+    ends with its life, inside an episode: there it would pay, or fine, agents for every step that they stay.
     """
-    shared = q.config.reward == "team" or not q.parts.own_values  # the team's value is learned from its reward
-    reward = share_reward(seen.reward, seen.observation.agent_mask, shared)
+    reward = share_reward(seen, q.shares_reward)
     return reward / rewards.sd if q.parts.own_values and seen.left is not None else rewards.normalise(reward)
 
 

@@ -9,6 +9,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from gacrl.types import Transition
+
 ENVS = "envs"
 """The axis of a mesh over which one seed's environments are spread (training.devices)."""
 
@@ -82,9 +84,15 @@ def mean_real(
     return jnp.where(real, values, 0.0).sum() / jnp.maximum(real.sum() if count is None else count, 1)
 
 
-def share_reward(reward: Float[Array, "*b N"], real: Bool[Array, "*b N"], team: bool) -> Float[Array, "*b N"]:
-    """Return the mean over the real agents for everyone, or each its own."""
+def share_reward(steps: Transition, team: bool) -> Float[Array, "*b N"]:
+    """Return the mean over the real agents for everyone, or each its own.
+
+    Where agents come and go within an episode, it is the mean over all slots, and an empty one earns 0: that over those
+    who are there would not rise when a jam clears, since who leaves it takes its reward along.
+    """
     if not team:
-        return reward
-    mean = jnp.where(real, reward, 0.0).sum(-1, keepdims=True) / jnp.maximum(real.sum(-1, keepdims=True), 1)
-    return jnp.broadcast_to(mean, reward.shape)
+        return steps.reward
+    real = steps.observation.agent_mask
+    among = jnp.maximum(real.sum(-1, keepdims=True), 1) if steps.left is None else real.shape[-1]
+    mean = jnp.where(real, steps.reward, 0.0).sum(-1, keepdims=True) / among
+    return jnp.broadcast_to(mean, steps.reward.shape)

@@ -193,8 +193,8 @@ class LearningConfig:
     symmetric_play: bool = False
     """Play greedily by the mean over the task's symmetries, eight for spread: eight times the messages."""
     reward: Literal["team", "own"] = "team"
-    """Every agent earns the team's mean reward, or its own. Values of the team (QMIX, VDN) are learned from the mean;
-    GACRL then has a value for each agent in place of the team's."""
+    """Every agent earns the team's mean reward, or its own. Values of the team (GACRL, QMIX, VDN) are learned from
+    the mean in any case."""
     exploration: str = "linear"
     """The rule by which random actions and the temperature of messages fall: none (no random actions), linear in time,
     fixed at their end, adaptive (as the task's progress rises), yoked (as the progress of another training rose), or
