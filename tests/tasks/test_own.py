@@ -20,6 +20,7 @@ from gacrl.cli.main import main
 from gacrl.scene import compose, discs
 from gacrl.tasks import own
 from gacrl.tasks.task import Metric, Task
+from gacrl.training.recorder import resuming
 
 pytestmark = pytest.mark.xdist_group("own")
 
@@ -83,6 +84,8 @@ def test_a_page_names_a_file_as_it_was_given(monkeypatch: pytest.MonkeyPatch):
     name, _ = own.bring(f"{BEACON.name}:Beacon")
     assert tasks.flag(name) == f" --env {shlex.quote(f'{BEACON.absolute()}:Beacon')}"
     assert tasks.flag(name, as_given=True) == f" --env {BEACON.name}:Beacon"
+    assert resuming(Path("run"), name) == f"gacrl resume run{tasks.flag(name)}"
+    assert resuming(Path("run"), "reference") == "gacrl resume run", "a run of ours knows its task"
 
 
 def test_one_of_ours_stays_ours():

@@ -232,7 +232,8 @@ class RunFolder:
 
 def resuming(path: Path, task: str = tasks.DEFAULT) -> str:
     """Return the command that goes on with a run, to copy: whatever its folder is called."""
-    return f"gacrl resume {shlex.quote(str(path))}{tasks.flag(task)}"
+    brought = "" if tasks.brought(task) is None else tasks.flag(task)  # the run's settings name one of ours
+    return f"gacrl resume {shlex.quote(str(path))}{brought}"
 
 
 def _origin(config: RunConfig, begun_from: str | None) -> dict[str, Any]:
