@@ -65,11 +65,11 @@ def test_the_teams_value_is_the_critics_less_what_each_agent_falls_short():
 TAUGHT = replace(SMALL, critic="told", averaged=False, network=replace(TALKING, latent="none"))
 
 
-def test_rewards_teach_the_teacher_and_the_teacher_the_agents():
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_rewards_teach_the_teacher_and_the_teacher_the_agents(rounds: int):
     """Each term of the loss has gradients in one of the two networks alone; who acts needs the agents alone."""
-    trainer = Trainer(
-        algorithms.make(TAUGHT, ENV, TRAINING), ENV, constant(), TRAINING.num_envs, TRAINING.num_steps
-    )
+    algorithm = algorithms.make(replace(TAUGHT, teacher_rounds=rounds), ENV, TRAINING)
+    trainer = Trainer(algorithm, ENV, constant(), TRAINING.num_envs, TRAINING.num_steps)
     state, _ = trainer.chunk(trainer.init((0,)), 4)
     learner = jax.tree.map(lambda leaf: leaf[0], state.learner)
     q = trainer.algorithm.init.args[0]  # pyright: ignore[reportFunctionMemberAccess] a partial
@@ -122,6 +122,8 @@ def test_a_teacher_is_told_all_whatever_happens_to_words():
     late = replace(TAUGHT, network=replace(TAUGHT.network, communication="dial"))
     with pytest.raises(ConfigError, match="algorithm.critic told needs messages that are heard in the step"):
         algorithms.make(late, ENV, TRAINING)
+    with pytest.raises(ConfigError, match="algorithm.teacher_rounds needs algorithm.critic told, not central"):
+        algorithms.make(replace(SMALL, critic="central", teacher_rounds=2), ENV, TRAINING)
 
 
 def test_a_lesson_is_what_each_action_loses_by_the_teacher():

@@ -16,6 +16,7 @@ from gacrl.envs.probes import Probe
 from gacrl.networks import communication
 from gacrl.networks.agent import AgentNetwork, unroll
 from gacrl.networks.communication import Neighbourhood
+from gacrl.networks.communication.told import Told
 from gacrl.tasks.spread.environment import Spread
 from gacrl.types import Arrives
 
@@ -56,6 +57,19 @@ def test_what_is_told_by_hand():
     spoken = net.speak(hidden, near, None, 1.0)
     np.testing.assert_array_equal(spoken.messages, [near.features])
     np.testing.assert_array_equal(spoken.hidden, hidden)
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_teachers_hear_what_others_made_of_it(rounds: int):
+    """0 hears 1, who hears 2: what 2 sees reaches 0 in the second round."""
+    net = drawn(lambda key: Told(Probe(num_agents=3), NetworkConfig(width=8), key, rounds=rounds))
+    graph = jnp.array([[0, 1, 0], [0, 0, 1], [0, 0, 0]], bool)
+
+    def heard(features: jax.Array) -> jax.Array:
+        return net.hear(jnp.ones((3, 8)), (), Neighbourhood(graph, jnp.zeros((3, 3, 0)), features=features), None)
+
+    moved = np.abs(jax.jacobian(heard)(jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))).max((1, 3)) > 0
+    np.testing.assert_array_equal(moved, [[0, 1, rounds == 2], [0, 0, 1], [0, 0, 0]])
 
 
 @pytest.mark.parametrize(

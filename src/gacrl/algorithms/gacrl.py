@@ -12,6 +12,7 @@
 from dataclasses import replace
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -27,6 +28,7 @@ from gacrl.config.checks import require
 from gacrl.config.run import TrainingConfig
 from gacrl.envs.environment import Environment
 from gacrl.networks.agent import AgentNetwork, AgentOutput, matched
+from gacrl.networks.communication.told import Told
 from gacrl.networks.critic import team_mean
 from gacrl.networks.layers import Linear, Mlp
 from gacrl.types import Metrics, Observation, PRNGKey
@@ -54,6 +56,10 @@ def make(
     config: GacrlConfig, env: Environment, training: TrainingConfig, progress: str | None = None
 ) -> Algorithm:
     """Make the learner for this task's shapes. progress: the task's measure that exploration follows."""
+    require(
+        config.critic == "told" or config.teacher_rounds == 1,
+        f"algorithm.teacher_rounds needs algorithm.critic told, not {config.critic}: others have no teacher",
+    )
     actions = choices(env)
     settings = matched(env, config.network, actions.size)
     width = settings.width
@@ -72,7 +78,14 @@ def make(
         value = (Mlp(width, (width,), layers_key), Linear(width, 1, head_key))
         if config.critic == "central":
             return Network(agent, value)
-        return Network(agent, value, AgentNetwork(env, told, actions.size, jax.random.fold_in(key, 1)))
+        return Network(agent, value, teacher(jax.random.fold_in(key, 1)))
+
+    def teacher(key: PRNGKey) -> AgentNetwork:
+        network = AgentNetwork(env, told, actions.size, key)
+        if config.teacher_rounds == 1:
+            return network
+        hears = Told(env, told, jax.random.fold_in(key, 1), rounds=config.teacher_rounds)
+        return eqx.tree_at(lambda it: it.communication, network, hears)
 
     def auxiliary(output: AgentOutput, observation: Observation) -> Metrics:
         if settings.latent == "none":

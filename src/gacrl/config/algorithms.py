@@ -372,6 +372,8 @@ class GacrlConfig(QLearningConfig):
     critic: Literal["told", "central", "sum"] = "central"
     """Q_tot is a central value plus the agents' advantages, or the sum of their values (as VDN); told: central, of
     agents who are told what the others see, and from whom those who act learn what each action loses."""
+    teacher_rounds: int = 1
+    """Rounds in which those are told (critic told): after the first each hears what the others made of it."""
     latent_weight: float = 1e-3
     """Weight of the code's loss: reconstruction and KL divergence."""
     exploration: str = "adaptive"
@@ -383,6 +385,7 @@ class GacrlConfig(QLearningConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         between("algorithm", self, 0.0, 1e6, "latent_weight")
+        between("algorithm", self, 1, 100, "teacher_rounds")
 
 
 AlgorithmConfig: TypeAlias = Any
