@@ -234,6 +234,7 @@ MEDIUM = {
     "vision 0": "talk-traffic-medium-5m-3-seeds",
     "the same with 200 environments": "talk-traffic-medium-exploring-2-seeds",
     "the team's reward shared": "talk-traffic-medium-shared-4-seeds",
+    "the same and a teacher": "talk-traffic-medium-told-in-rounds-4-seeds",
 }
 TRAFFIC = {
     "longer exploration and replay, fresh": "talk-traffic-easy-fresh-3-seeds",
