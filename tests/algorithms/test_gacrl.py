@@ -126,6 +126,12 @@ def test_a_teacher_is_told_all_whatever_happens_to_words():
         algorithms.make(replace(SMALL, critic="central", teacher_rounds=2), ENV, TRAINING)
 
 
+@pytest.mark.parametrize(("env_steps", "for_speed"), [(999_999, False), (1_000_000, True)])
+def test_long_trainings_are_compiled_for_speed(env_steps: int, for_speed: bool):
+    made = algorithms.make(SMALL, ENV, replace(TRAINING, env_steps=env_steps))
+    assert made.compiled_for_speed == for_speed
+
+
 def test_a_lesson_is_what_each_action_loses_by_the_teacher():
     """Of four agents one may not do the last action, and two are not there."""
     q = algorithms.make(TAUGHT, ENV, TRAINING).init.args[0]  # pyright: ignore[reportFunctionMemberAccess] a partial

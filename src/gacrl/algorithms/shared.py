@@ -87,8 +87,8 @@ def mean_real(
 def share_reward(steps: Transition, team: bool) -> Float[Array, "*b N"]:
     """Return the mean over the real agents for everyone, or each its own.
 
-    Where agents come and go within an episode, it is the mean over all slots, and an empty one earns 0: that over those
-    who are there would not rise when a jam clears, since who leaves it takes its reward along.
+    Where agents come and go within an episode, the mean is over all slots, and an empty one earns 0. A mean over those
+    who are there would not rise when a jam clears.
     """
     if not team:
         return steps.reward

@@ -119,7 +119,7 @@ def embedded(
     rounds: int = 1,
     who: bool = False,
 ) -> Float[Array, "N K H"]:
-    """Embed what each agent receives of its speakers beside what it sees of them; who: and beside who they are.
+    """Embed what each agent receives of its speakers, with what it sees of them and, if asked, who they are.
 
     Where agents do not see each other, all hear the same of a speaker: it is embedded once, not for every listener.
     """

@@ -17,9 +17,7 @@ from gacrl.types import PRNGKey
 
 
 class Hearing(eqx.Module):
-    """What a receiver's own weights make of one round: an embedding of what each speaker says, attended to as symbols
-    are.
-    """
+    """Hear one round: embed what each speaker says, and attend to it as to symbols."""
 
     edge: Mlp
     query: Linear
@@ -61,6 +59,7 @@ class Told(Hearing, Communication):
     """
 
     later: tuple[Hearing, ...]
+    """A teacher's rounds after the first."""
 
     def __init__(
         self, env: Environment, config: NetworkConfig, key: PRNGKey, gain: float | None = None, rounds: int = 1
