@@ -147,7 +147,7 @@ def _readable_on(colour: str) -> str:
 
 @functools.cache
 def typeface(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which comes with matplotlib: the same everywhere, and it has every letter of a title."""
+    """Return DejaVu Sans, which comes with matplotlib: the same everywhere, and it has every letter of a title."""
     import matplotlib  # a fifth of a second, which no run waits for at its start
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"

@@ -62,7 +62,7 @@ def discs(
     lit: Bool[Array, " K"] | None = None,
     colour: Int[Array, " K"] | int = PLAIN,
 ) -> Discs:
-    """K things of one radius; all are there, and none is lit, unless it is said."""
+    """Make K things of one radius; all are there, and none is lit, unless it is said."""
     count = positions.shape[0]
     return Discs(
         positions=positions,

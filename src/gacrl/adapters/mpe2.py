@@ -73,7 +73,7 @@ def evaluate(
     @jax.jit
     @jax.vmap
     def show(state: EnvState, features: Array) -> Any:
-        """What MPE2 shows, and for scripts the exact state."""
+        """Return what MPE2 shows, and for scripts the exact state."""
         return env.from_features(features)._replace(state=played.pack(state))
 
     measures = jax.eval_shape(lambda: played.measure(env.reset(key, params)[0], params))

@@ -14,6 +14,6 @@ from gacrl.envs.environment import Environment
 
 
 def make(config: DialConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
-    """Q-learning of the sum, through messages."""
+    """Make Q-learning of the sum, through messages."""
     parts = Parts(q_learning.agents_alone(config, env), summed)
     return q_learning.make(config, env, training, progress, parts)

@@ -134,5 +134,5 @@ def normal_log_prob(pi: Normal, drawn: Float[Array, "*b A"]) -> Float[Array, "*b
 
 
 def normal_entropy(pi: Normal) -> Float[Array, "*b"]:
-    """½ log(2πe) + log std, summed over the numbers of an action."""
+    """Return ½ log(2πe) + log std, summed over the numbers of an action."""
     return jnp.where(pi.there, pi.log_std + 0.5 * math.log(2 * math.pi * math.e), 0.0).sum(-1)

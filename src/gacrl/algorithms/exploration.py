@@ -19,7 +19,7 @@ from gacrl.types import PRNGKey, Transition
 def progress_between(
     start: Float[Array, ""] | float, end: Float[Array, ""] | float, fraction: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Linear from start to end while the fraction goes from 0 to 1; the end after it."""
+    """Move linearly from start to end while the fraction goes from 0 to 1, and stay at the end."""
     return start + jnp.clip(fraction, 0.0, 1.0) * (end - start)
 
 
@@ -66,7 +66,7 @@ def none(settings: LearningConfig, planned_steps: int, progress: str | None) -> 
 
 
 def linear(settings: LearningConfig, planned_steps: int, progress: str | None) -> Exploration:
-    """ε and τ fall linearly over `exploration_steps`."""
+    """Let ε and τ fall linearly over `exploration_steps`."""
 
     def level(env_steps: Int[Array, ""]) -> Level:
         share = env_steps / max(settings.exploration_steps, 1)
@@ -76,7 +76,7 @@ def linear(settings: LearningConfig, planned_steps: int, progress: str | None) -
 
 
 def fixed(settings: LearningConfig, planned_steps: int, progress: str | None) -> Exploration:
-    """ε and τ stay at their end."""
+    """Keep ε and τ at their end."""
     return in_time(lambda env_steps: Level(settings.epsilon_end, settings.temperature_end), moves=False)
 
 
@@ -96,7 +96,7 @@ _MEMORY = 0.05
 
 
 def adaptive(settings: LearningConfig, planned_steps: int, progress: str | None) -> Exploration:
-    """ε and τ follow progress c: end + (start − end) (1 − c)², with c from episodes that do not explore.
+    """Let ε and τ follow progress c: end + (start − end) (1 − c)², with c from episodes that do not explore.
 
     The paper's (13) to (16) without the clock, and with a signal that exploration itself does not depress: a
     share of the training episodes is played greedily (their steps count as any others), and c is the running

@@ -44,7 +44,7 @@ def central(
     action: Int[Array, " N"],
     observation: Observation,
 ) -> Float[Array, "1"]:
-    """Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)]: the critic of (12), and what each agent falls short of it."""
+    """Return Q_tot = V(s) + Σ_i [A_i(a_i) − max_a A_i(a)]: the critic of (12), and what agents fall short of it."""
     layers, head = network.team
     available = jnp.where(actions.mask(observation.action_mask), output.head, -jnp.inf)
     shortfall = taken(output.head, action) - available.max(-1)

@@ -48,12 +48,12 @@ class Coverage(NamedTuple):
     episode: Int[Array, ""]
 
     def signal(self, kind: CoverageSignal) -> Float[Array, ""]:
-        """c of equations (13) and (14). `episode_so_far` is 0 at an episode's first step."""
+        """Return c of equations (13) and (14). `episode_so_far` is 0 at an episode's first step."""
         return self.last_episode if kind == "last_episode" else self.total / jnp.maximum(self.steps, 1)
 
 
 def no_coverage() -> Coverage:
-    """Before the first step."""
+    """Return what is known before the first step."""
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
     return Coverage(total=zero, steps=none, last_episode=zero, episode=none)
 

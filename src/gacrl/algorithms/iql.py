@@ -16,11 +16,11 @@ from gacrl.types import Observation
 def independent(
     network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, " N"]:
-    """Q_i of each agent's own action."""
+    """Return Q_i of each agent's own action."""
     return taken(output.head, action)
 
 
 def make(config: IqlConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
-    """Q-learning of each agent's value."""
+    """Make Q-learning of each agent's value."""
     parts = Parts(q_learning.agents_alone(config, env), independent, own_values=True)
     return q_learning.make(config, env, training, progress, parts)

@@ -25,7 +25,7 @@ HUBER_DELTA = 10.0
 
 
 def huber(error: Float[Array, "*b"], delta: float) -> Float[Array, "*b"]:
-    """½ e² up to |e| = delta, linear beyond (Huber 1964); elementwise."""
+    """Return ½ e² up to |e| = delta, linear beyond (Huber 1964); elementwise."""
     small = jnp.minimum(jnp.abs(error), delta)
     return 0.5 * jnp.square(small) + delta * (jnp.abs(error) - small)
 
@@ -58,7 +58,7 @@ class ValueNorm(NamedTuple):
 
 
 def no_returns() -> ValueNorm:
-    """Before any return was seen: normalising changes nothing."""
+    """Return the moments before any return was seen: normalising changes nothing."""
     zero = jnp.zeros(())
     return ValueNorm(zero, zero, zero)
 

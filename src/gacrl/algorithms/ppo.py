@@ -178,7 +178,7 @@ def _require_fit(config: PpoConfig, env: Environment) -> None:
 
 
 def networks(p: Setup, key: PRNGKey) -> Network:
-    """Actor and critic, orthogonal."""
+    """Make actor and critic, orthogonal."""
     actor_key, critic_key = jax.random.split(key)
     gain = 2**0.5
     return Network(
@@ -220,7 +220,7 @@ def level_of(p: Setup, learner: LearnerState) -> Level:
 
 
 def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
-    """Sampled from π, among random actions where the rule of exploration has some; or greedy."""
+    """Sample from π, among random actions where the rule of exploration has some; or act greedily."""
     level = level_of(p, learner)
 
     def act(memory: Memory, observation: Observation, key: PRNGKey) -> tuple[Decision, Memory]:
@@ -257,7 +257,7 @@ def policy(p: Setup, learner: LearnerState, explore: bool) -> Policy:
 def targets(
     p: Setup, learner: LearnerState, steps: Transition, memory: PpoMemory
 ) -> tuple[Float[Array, "T E N"], Float[Array, "T E N"]]:
-    """Advantages and returns of every agent, in the units of the reward."""
+    """Return advantages and returns of every agent, in the units of the reward."""
     critic, value = learner.network.critic, steps.decision.extras["value"]
 
     def after(steps: Transition, memory: Memory, value: Float[Array, "T N"]) -> Float[Array, "T N"]:
@@ -301,7 +301,7 @@ def loss(
     count: Int[Array, ""] | None = None,
     temperature: Float[Array, ""] | float = 1.0,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Policy, critic and entropy terms on segments, and the messages' own; means over the real agents.
+    """Sum policy, critic and entropy terms on segments, and the messages' own; means over the real agents.
 
     memory: what actor and critic carried before each segment, [B, …]. count: as in `mean_real`.
     """
@@ -347,7 +347,7 @@ def gradients_on(p: Setup, whole: tuple[Any, ...], rows: Int[Array, " rows"]) ->
 
 
 def update(p: Setup, learner: LearnerState, rollout: Rollout, key: PRNGKey) -> tuple[LearnerState, Metrics]:
-    """Targets, then epochs of gradient steps on shuffled minibatches of a rollout [T, E, …]."""
+    """Compute targets, then take epochs of gradient steps on shuffled minibatches of a rollout [T, E, …]."""
     turn_key, shuffle_key = jax.random.split(key)
     memory = split_memory(rollout.first_memory)._replace(exploration=())
     steps = chosen(p, rollout.transitions)
@@ -412,7 +412,7 @@ def sample_of(steps: Transition, advantage: Float[Array, "T E N"], target: Float
 
 
 def minibatches(key: PRNGKey, size: int, epochs: int, count: int) -> Int[Array, "steps rows"]:
-    """Shuffled rows, anew for each epoch; what does not fill a minibatch is left out of that epoch."""
+    """Shuffle rows, anew for each epoch; what does not fill a minibatch is left out of that epoch."""
     count = min(count, size)
     rows = size // count
     shuffled = jax.vmap(lambda key: permutation(key, size))(jax.random.split(key, epochs))
@@ -420,7 +420,7 @@ def minibatches(key: PRNGKey, size: int, epochs: int, count: int) -> Int[Array, 
 
 
 def permutation(key: PRNGKey, size: int) -> Int[Array, " size"]:
-    """0 to size − 1 in random order.
+    """Return 0 to size − 1 in random order.
 
     Random numbers are sorted that hold the rows in their low bits: a CPU takes a fifth or less of the time that
     `jax.random.permutation` takes for pairs. Where the random bits are equal, a random mask of the rows decides.

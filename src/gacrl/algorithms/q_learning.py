@@ -144,7 +144,7 @@ def epsilon_greedy(
 
 
 def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
-    """ε-greedy with the network that learns, or greedy, then with the averaged one if so configured."""
+    """Act ε-greedily with the network that learns, or greedily, then with the averaged one if so configured."""
     network = learner.target if q.config.averaged and not explore else learner.network
     level = q.explorer.level(learner.exploration, learner.env_steps)
 

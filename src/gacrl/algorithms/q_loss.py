@@ -44,7 +44,7 @@ class Looks(NamedTuple):
 def along(
     network: AgentNetwork, steps: Transition, memory: Memory, keys: Array | None, temperature: Array | float
 ) -> tuple[AgentOutput, Memory]:
-    """Along windows [W, B, …]; keys and memory [B, …]."""
+    """Unroll a network along windows [W, B, …]; keys and memory [B, …]."""
     length = steps.first.shape[0]
     drawn = None if keys is None else jax.vmap(lambda key: jax.random.split(key, length), 0, 1)(keys)
     begins = jax.vmap(beginnings, 1, 1)(steps.first, steps.left)
@@ -175,7 +175,7 @@ def window_ends(q: Setup, seen: Transition) -> Ends:
 def window_targets(
     q: Setup, reward: Float[Array, "W M"], future: Float[Array, "L M"], ends: Ends, gamma: Float[Array, ""] | float
 ) -> Float[Array, "L M"]:
-    """n rewards and then the value that followed; fewer rewards where the episode, or a life of its own, ends."""
+    """Return n rewards and then the value that followed; fewer where the episode, or a life of its own, ends."""
     learned, n = q.config.sequence_length, q.config.n_step
     earned = sum(gamma**k * ends.weight[k, :learned] * reward[k : k + learned] for k in range(n))
     length = ends.at - jnp.arange(learned) + 1

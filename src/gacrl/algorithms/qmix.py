@@ -21,12 +21,12 @@ from gacrl.types import Observation, PRNGKey
 def monotonic(
     network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, "1"]:
-    """Q_tot rises with every Q_i; how much, the state tells."""
+    """Return Q_tot, which rises with every Q_i; how much, the state tells."""
     return network.team(taken(output.head, action), global_state(observation), observation.agent_mask)[None]
 
 
 def make(config: QmixConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
-    """Q-learning with the mixing network."""
+    """Make Q-learning with the mixing network."""
     num_choices = choices(env).size
     settings = matched(env, config.network, num_choices)
     state_size = jax.eval_shape(lambda: global_state(env.reset(jax.random.key(0), env.default_params())[1])).size

@@ -60,7 +60,7 @@ def newest(replay: Replay[Item]) -> Int[Array, ""]:
 
 
 def sample_rows(replay: Replay[Item], key: PRNGKey, batch_size: int) -> Int[Array, " B"]:
-    """Uniform rows, with replacement; there must be at least one item.
+    """Draw uniform rows, with replacement; there must be at least one item.
 
     The remainder of 32 random bits: no row is favoured by more than one part in 2³² / size.
     """

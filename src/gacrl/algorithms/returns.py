@@ -41,7 +41,7 @@ def generalised_advantages(
     gamma: Float[Array, ""] | float,
     gae_lambda: Float[Array, ""] | float,
 ) -> Float[Array, "T *b"]:
-    """Advantages (Schulman et al. 2016, eq. 16): Σ_k (γλ)^k δ_{t+k}, δ_t = r_t + γ V(s'_t) − V(s_t).
+    """Return advantages (Schulman et al. 2016, eq. 16): Σ_k (γλ)^k δ_{t+k}, δ_t = r_t + γ V(s'_t) − V(s_t).
 
     next_value: of the observation that followed, before any reset. The sum stops where an episode ends.
     """
@@ -64,7 +64,7 @@ def n_step_returns(
     gamma: Float[Array, ""] | float,
     n: int,
 ) -> Float[Array, "T *b"]:
-    """r_t + γ r_{t+1} + … + γ^m V(s'_{t+m−1}): m is n, or less where the episode or the T steps end before."""
+    """Return r_t + γ r_{t+1} + … + γ^m V(s'_{t+m−1}): m is n, or less where episode or T steps end before."""
     weight, last = n_step_window(terminated | truncated, n)
     time = jnp.arange(reward.shape[0]).reshape(-1, *[1] * (reward.ndim - 1))
     total = jnp.zeros_like(reward)

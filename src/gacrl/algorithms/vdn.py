@@ -17,11 +17,11 @@ from gacrl.types import Observation
 def summed(
     network: Network, output: AgentOutput, action: Int[Array, " N"], observation: Observation
 ) -> Float[Array, "1"]:
-    """Q_tot = Σ_i Q_i over the real agents."""
+    """Return Q_tot = Σ_i Q_i over the real agents."""
     return jnp.where(observation.agent_mask, taken(output.head, action), 0.0).sum(keepdims=True)
 
 
 def make(config: VdnConfig, env: Environment, training: TrainingConfig, progress: str | None = None) -> Algorithm:
-    """Q-learning of the sum."""
+    """Make Q-learning of the sum."""
     parts = Parts(q_learning.agents_alone(config, env), summed)
     return q_learning.make(config, env, training, progress, parts)

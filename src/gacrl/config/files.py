@@ -50,7 +50,7 @@ def to_dict(config: RunConfig) -> dict[str, Any]:
 
 
 def from_dict(data: Mapping[str, Any], base: RunConfig | None = None) -> RunConfig:
-    """Settings from plain data over a base (the preset that the data names, else the default one).
+    """Make settings from plain data over a base (the preset that the data names, else the default one).
 
     Raises ConfigError for an unknown key (with the nearest known one), a value of the wrong type, or a task that is
     not at hand.

@@ -15,7 +15,7 @@ _RADIUS = "0.2"
 
 
 def converted(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain settings in today's names. Raises ConfigError for what no version since 0.1.0 does as it did."""
+    """Return plain settings in today's names. Raises ConfigError for what no version since 0.1.0 does as it did."""
     found = {name: dict(part) if isinstance(part, Mapping) else part for name, part in data.items()}
     preset, algorithm = found.get("preset"), found.get("algorithm")
     if isinstance(preset, str) and preset in _PRESETS:

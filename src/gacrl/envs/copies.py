@@ -18,7 +18,7 @@ Keys: TypeAlias = Key[Array, " E"] | UInt32[Array, "E _"]
 
 
 def reset(env: Environment, params: EnvParams, keys: Keys) -> tuple[EnvState, Observation]:
-    """E fresh episodes."""
+    """Begin E fresh episodes."""
     return jax.vmap(env.reset, (0, None))(typed_keys(keys), params)
 
 

@@ -211,7 +211,7 @@ def record_many(
     look: Look | None = None,
     pictures: bool = True,
 ) -> list[Episode]:
-    """K episodes, each up to its end: the very episodes that `evaluate` measures with the same arguments.
+    """Record K episodes, each up to its end: the very episodes that `evaluate` measures with the same arguments.
 
     look: what is to be seen of a state; without it discs, where the task says where its agents are. An environment that
     lives in Python draws its own pictures, unless nobody wants `pictures`.

@@ -94,7 +94,7 @@ class EpisodeSummary(NamedTuple):
 
 
 def no_episodes(table: Table) -> EpisodeSummary:
-    """Before any episode has ended."""
+    """Return the tallies before any episode has ended."""
     zeros = jnp.zeros(len(table.metrics))
     return EpisodeSummary(jnp.zeros((), jnp.int32), zeros, zeros, zeros)
 

@@ -78,7 +78,7 @@ def _counting(table: Table) -> tuple[Callable[..., Tally], Callable[[Tally], Any
 
 
 def batches(num_episodes: int) -> Iterator[range]:
-    """Episodes by number, as many each time: a last batch goes beyond the end."""
+    """Return episodes by number, as many each time: a last batch goes beyond the end."""
     count = -(-num_episodes // AT_ONCE)
     size = -(-num_episodes // count)
     return (range(start, start + size) for start in range(0, count * size, size))

@@ -82,7 +82,7 @@ def with_interval(found: Estimate | Difference | tuple[float, float, float], for
 
 
 def iqm(values: Numbers) -> Any:
-    """Interquartile mean: of all S × K scores, without the ⌊S K / 4⌋ lowest and as many of the highest.
+    """Return the interquartile mean: of all S × K scores, without the ⌊S K / 4⌋ lowest and as many of the highest.
 
     values: [S] or [..., S, K]. Returns [...]; a number for [S] and [S, K]. Raises NotFinite, a ValueError, for NaN,
     and UserError where there are no scores.
@@ -99,7 +99,7 @@ def mean(values: Numbers) -> Any:
 
 
 def median(values: Numbers) -> Any:
-    """Median over tasks of each task's mean, as in rliable; with scores [S] of one task, the median of its seeds.
+    """Return the median over tasks of each task's mean, as in rliable; with [S] scores of one task, that of its seeds.
 
     [S] or [..., S, K] to [...]. With one task as [S, 1] it is the median of the seeds as well (rliable: the mean).
     Raises as `iqm` does.
@@ -134,7 +134,7 @@ def difference(a: Numbers, b: Numbers, statistic: Statistic = iqm, reps: int = 2
 
 
 def probability_of_improvement(a: Numbers, b: Numbers, reps: int = 2000, seed: int = 0) -> Estimate:
-    """P(a seed of a scores higher than a seed of b), ties half, the mean over tasks, with its 95 % interval.
+    """Return P(a seed of a scores higher than a seed of b), ties half, the mean over tasks, with its 95 % interval.
 
     The Mann-Whitney U statistic over the number of pairs (Agarwal et al. 2021). Scores as for `difference`. A
     protocol that claims an improvement asks for a point of at least 0.95 and a low above 0.5

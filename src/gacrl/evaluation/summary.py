@@ -34,7 +34,7 @@ def estimated(values: Float[np.ndarray, "S K"]) -> Estimate:
 
 
 def over_seeds(values: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Per metric: the mean over the seeds, its 95 % Student interval (null for one seed), each seed's value."""
+    """Return per metric: the mean over the seeds, its 95 % Student interval (null for one seed), each seed's value."""
     return {name: _one(np.asarray(per_seed, float)) for name, per_seed in values.items()}
 
 

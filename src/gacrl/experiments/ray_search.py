@@ -252,7 +252,7 @@ def encoded(spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decoded(spec: Spec, values: Mapping[str, Any]) -> dict[str, Any]:
-    """And back."""
+    """Return Optuna's values as they stand in settings."""
     choices = {one.setting for one in spec.searched if one.kind == "choice"}
     return {name: json.loads(value) if name in choices else value for name, value in values.items()}
 

@@ -69,12 +69,12 @@ class _Graph:
         return name
 
     def number(self, name: str) -> float | None:
-        """The single number that a constant is; None for anything else."""
+        """Return the single number that a constant is; None for anything else."""
         array = self.known.get(name)
         return None if array is None or array.size != 1 else float(array.reshape(()))
 
     def alone(self, name: str, kind: str) -> Node | None:
-        """Who makes this array, where that is of this kind and nobody else takes it."""
+        """Return who makes this array, where that is of this kind and nobody else takes it."""
         node = self.made_by.get(name)
         return node if node is not None and node.op_type == kind and self.uses[name] == 1 else None
 

@@ -30,7 +30,7 @@ def bits_sent(env: Environment, config: NetworkConfig) -> float | None:
 
 
 def bits_used(episodes: Sequence[Episode]) -> float | None:
-    """Entropy of the symbol of an agent's last round, over all agents, steps and episodes, in bits.
+    """Return the entropy of the symbol of an agent's last round, over all agents, steps and episodes, in bits.
 
     What a code made for these frequencies would need for each; at most log2 of the vocabulary. None where nothing
     is said, or messages are no symbols.

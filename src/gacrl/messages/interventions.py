@@ -108,7 +108,7 @@ class _Late(NamedTuple):
 
 
 def delay(steps: int) -> Intervention:
-    """Words arrive this many steps after they were said; in an episode's first steps nothing arrives."""
+    """Let words arrive this many steps after they were said; in an episode's first steps nothing arrives."""
     steps = whole(steps, "delay")
     require(1 <= steps <= 1_000, f"delay must be a whole number of steps between 1 and 1000, not {steps}")
 

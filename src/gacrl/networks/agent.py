@@ -96,7 +96,7 @@ class AgentNetwork(eqx.Module):
         self.sight, self.telling = env.sight, env.telling
 
     def initial_memory(self, num_agents: int) -> Memory:
-        """() for a network that remembers nothing."""
+        """Return an empty memory; () for a network that remembers nothing."""
         inbox = self.communication.empty_inbox(num_agents)
         if self.memory is None and isinstance(inbox, tuple):
             return ()

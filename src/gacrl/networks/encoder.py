@@ -46,7 +46,7 @@ def sample_latent(
 def kl_divergence(
     mean: Float[Array, "..."], log_variance: Float[Array, "..."], axis: int = -1
 ) -> Float[Array, "..."]:
-    """KL(N(μ, σ²) ‖ N(0, I)), summed over the axis of the latent dimensions."""
+    """Return KL(N(μ, σ²) ‖ N(0, I)), summed over the axis of the latent dimensions."""
     return -0.5 * (1 + log_variance - jnp.square(mean) - jnp.exp(log_variance)).sum(axis)
 
 

@@ -47,7 +47,7 @@ def gumbel_sigmoid(
 def normal_and_gumbel(
     key: PRNGKey, num_normal: int, num_gumbel: int
 ) -> tuple[Float[Array, " num_normal"], Float[Array, " num_gumbel"]]:
-    """Standard normal and Gumbel numbers out of one draw, by their inverse distribution functions."""
+    """Draw standard normal and Gumbel numbers out of one draw, by their inverse distribution functions."""
     uniform = jax.random.uniform(key, (num_normal + num_gumbel,), minval=jnp.finfo(jnp.float32).tiny)
     centred = jnp.maximum(2 * uniform[:num_normal] - 1, jnp.nextafter(-1.0, 0.0))
     return jnp.sqrt(2.0) * jax.lax.erf_inv(centred), -jnp.log(-jnp.log(uniform[num_normal:]))

@@ -244,7 +244,7 @@ def profile(
     xlabel: str,
     styles: Mapping[str, Look] | None = None,
 ) -> str:
-    """Performance profiles: for each name thresholds [P], the share of runs above them [P] and its bounds; SVG.
+    """Draw performance profiles: for each name thresholds [P], the share of runs above them [P] and its bounds; SVG.
 
     The labels beside it are in the order of the mean share. styles: from `looks`.
     """

@@ -32,7 +32,7 @@ class Label(NamedTuple):
 
 
 def literal(text: str) -> str:
-    """Text that matplotlib shows as it is: two dollars would make it a formula."""
+    """Return text that matplotlib shows as it is: two dollars would make it a formula."""
     return text.replace("$", r"\$")
 
 

@@ -146,7 +146,7 @@ class _Figure:
         return f"![{caption.replace(']', '&#93;')}]({figures}/{self.name}.svg)\n\n*{caption}*"
 
     def inline(self) -> str:
-        """The svg element alone; its ids carry the figure's name, since a page holds several figures."""
+        """Return the svg element alone; its ids carry the figure's name, since a page holds several figures."""
         element = self.svg[self.svg.index("<svg") :].strip()
         element = re.sub(r'\bid="', f'id="{self.name}-', element)
         element = re.sub(r'href="#', f'href="#{self.name}-', element)
@@ -171,7 +171,7 @@ class Page:
         self._blocks.append(_Text(paragraph))
 
     def code(self, text: str) -> None:
-        """Commands or a listing, line by line."""
+        """Show commands or a listing, line by line."""
         self._blocks.append(_Code(text))
 
     def details(self, summary: str, text: str) -> None:

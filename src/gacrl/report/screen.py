@@ -22,7 +22,7 @@ _BELOW = 6
 
 
 def terminal_width() -> int:
-    """Columns of the terminal; COLUMNS, where it is set, goes before what the terminal says."""
+    """Return the columns of the terminal; COLUMNS, where it is set, goes before what the terminal says."""
     asked = os.environ.get("COLUMNS", "")
     if asked.isdecimal() and int(asked) > 0:
         return int(asked)

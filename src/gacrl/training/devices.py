@@ -48,7 +48,7 @@ def prepare_jax(num_seeds: int = 1) -> None:
 
 
 def compiler_options(for_speed: bool = True, library_sums: bool = False) -> dict[str, Any]:
-    """Options for a training program, of many small pieces, on the versions that they were measured with.
+    """Return options for a training program, of many small pieces, on the versions that they were measured with.
 
     XLA hands matrix products and, from 0.10 on, also sums to a kernel library; for sums of this size the call
     costs more than the sum (0.57 instead of 0.67 ms for a step of the paper's schedule). Along windows of many steps it
@@ -116,7 +116,7 @@ def _shares(num_seeds: int, num_envs: int | None) -> tuple[int, int, list[Any]]:
 
 @jax.jit
 def stack_seeds(members: list[PyTree]) -> PyTree:
-    """Pytrees of single seeds as one, with the seeds in front of every axis.
+    """Stack pytrees of single seeds as one, with the seeds in front of every axis.
 
     One program, as is each of those below: leaf by leaf a start would compile hundreds of tiny ones.
     """
@@ -243,7 +243,7 @@ def _distinct(leaf: jax.Array) -> list[Any]:
 
 
 def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """`function(member, *shared)` for one seed, as a function of the stacked seeds.
+    """Make of `function(member, *shared)`, for one seed, a function of the stacked seeds.
 
     Seeds are sharded over the devices. Within one device they take turns: on a CPU, mapping them instead makes
     every small matrix product a batch of them, and gains nothing (docs/design.md). What is within a seed is left to

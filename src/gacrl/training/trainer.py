@@ -158,7 +158,7 @@ class AbstractTrainer(ABC):
         self.chunk = self.make_chunk()
 
     def init(self, seeds: tuple[int, ...]) -> TrainState:
-        """Fresh training states of these seeds, stacked."""
+        """Make fresh training states of these seeds, stacked."""
         return shard_seeds(self.init_stacked(seeds), self.mesh)
 
     def init_stacked(self, seeds: tuple[int, ...]) -> TrainState:
@@ -304,7 +304,7 @@ class Trainer(AbstractTrainer):
         return self.learn(state, carry, experience, update_key, key)
 
     def chunk_of_one(self, state: TrainState, num_updates: Int[Array, ""]) -> tuple[TrainState, ChunkReport]:
-        """`num_updates` turns of the loop, for one seed."""
+        """Take `num_updates` turns of the loop, for one seed."""
         update = jax.jit(self._update, inline=True)  # traced once for the shapes and the loop
         start = self.none_yet(state, jax.eval_shape(update, state))
         running = jax.lax.fori_loop(
@@ -329,7 +329,7 @@ class Trainer(AbstractTrainer):
 
     @partial(jax.jit, static_argnums=(0, 2, 3, 4))
     def record(self, learner: Learner, stream: Stream, num_episodes: int, explore: bool = False) -> Played:
-        """K episodes of one seed's learner as they happen, the very ones that `evaluate` measures."""
+        """Record K episodes of one seed's learner as they happen, the very ones that `evaluate` measures."""
         return play(
             self.evaluation_env,
             self.algorithm.policy(learner, explore),

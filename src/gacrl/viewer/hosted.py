@@ -73,7 +73,7 @@ class HostRoom:
         return stood
 
     def joined(self, params: EnvParams, state: Past, before: int, now: int, seed: int, t: int) -> Stood:
-        """Raises AssertionError: nobody comes or goes."""
+        """Refuse: raises AssertionError, since nobody comes or goes."""
         raise AssertionError("no hosted task has a team")
 
     def decide(

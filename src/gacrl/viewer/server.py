@@ -66,7 +66,7 @@ class Budget:
     since: float = field(default_factory=time.monotonic)
 
     def takes(self) -> bool:
-        """Whether there is one left; it is taken."""
+        """Take one, if there is one left; returns whether."""
         now = time.monotonic()
         self.left = min(self.left + (now - self.since) * _A_SECOND, _AT_ONCE)
         self.since = now

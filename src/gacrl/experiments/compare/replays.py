@@ -64,7 +64,7 @@ class _Seeds:
     explore: bool
 
     def played(self, seed: int) -> Played:
-        """The closing evaluation of a seed, by its place."""
+        """Return the closing evaluation of a seed, by its place."""
         return self.trainer.record(self.learners[seed], "report", self.episodes, self.explore)
 
 

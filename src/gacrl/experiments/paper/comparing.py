@@ -37,7 +37,7 @@ Values = Float[np.ndarray, " S"]
 
 
 def order(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """GACRL is better than some and worse than others, each by more than the seeds explain."""
+    """Judge whether GACRL is better than some and worse than others, each by more than the seeds explain."""
     better, worse = claim.settings["better_than"], claim.settings.get("worse_than", ())
     found = _Ranking(claim, reading, evidence, [*better, *worse])
     ahead = [found.less[who] for who in better]
@@ -51,7 +51,7 @@ def order(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def competitive(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """GACRL is behind nobody by more than the margin, a share of the way from random to the oracle."""
+    """Judge whether GACRL is behind nobody by more than the margin, a share of the way from random to the oracle."""
     found = _Ranking(claim, reading, evidence, claim.settings["others"])
     agreement: Agreement = OPEN
     if any(d.high < -found.margin for d in found.less.values()):
@@ -62,7 +62,7 @@ def competitive(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
 
 
 def similar(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """GACRL and the others are equivalent: two one-sided tests within the margin."""
+    """Judge whether GACRL and the others are equivalent: two one-sided tests within the margin."""
     found = _Ranking(claim, reading, evidence, claim.settings["others"])
     tests = {who: equivalent(found.values["GACRL"], found.values[who], found.margin) for who in found.less}
     agreement: Agreement = OPEN
@@ -89,7 +89,7 @@ class _Ranking:
         self._trained = set(self.values) - set(SCRIPTED)
 
     def outcome(self, agreement: Agreement, more: str = "") -> Outcome:
-        """The verdict, and its numbers in the measure's own sign."""
+        """Return the verdict, and its numbers in the measure's own sign."""
         chance, random, test = against_random(self.values["GACRL"], self.values["random"], self.margin)
         because = (
             f"{self.measure.label}, GACRL less each: {_listed({**self.less, 'random': random}, self.measure)}, {test}; "

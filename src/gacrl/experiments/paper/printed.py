@@ -43,7 +43,7 @@ Printed = Mapping[str, tuple[Row, tuple[float, ...]]]
 
 
 def value(claim: Claim, reading: Reading, evidence: Evidence) -> Outcome:
-    """Printed numbers against what another run of ours would print, and against what random would.
+    """Hold printed numbers against what another run of ours would print, and against what random would.
 
     The intervals hold for all the table's cells at once; those of a claim that names its own cells, for these.
     """

@@ -92,7 +92,7 @@ def of_one(draws: Float[np.ndarray, " R"]) -> Span:
 
 
 def best_of_random(measure: Measure, reading: Reading, evidence: Evidence) -> Span:
-    """95 % interval of the best that a random policy shows in as many log lines, at each line's difficulty."""
+    """Return the 95 % interval of the best that a random policy shows in as many log lines of such difficulty."""
     rng = np.random.default_rng(0)
     stretches = evidence.reference(reading.column, "random").stretches
     lines = [measure.sign * measured(measure.weights, metrics)[:, None] for metrics in stretches]

@@ -127,7 +127,7 @@ def in_windows(config: RunConfig) -> RunConfig:
 
 
 def remembering(shared: Base) -> RunConfig | None:
-    """Silent agents with a memory, where they see what others do."""
+    """Make silent agents with a memory, where they see what others do."""
     if not shared.case.moves_tell:
         return None
     silent = sends(NONE, shared)
@@ -144,7 +144,7 @@ def uttering(shared: Base) -> RunConfig | None:
 
 
 def learns_by(preset: str, shared: Base, times: int = 1) -> RunConfig:
-    """Another learner with the same network, which sends symbols; times: as many steps."""
+    """Make another learner with the same network, which sends symbols; times: as many steps."""
     talking, other = shared.talking, configuration.on_task(presets.preset(preset), shared.talking.task)
     recurrent = talking.algorithm.network.recurrent
     network = replace(talking.algorithm.network, latent="none", parameters=shared.parameters, recurrent=recurrent)

@@ -93,7 +93,7 @@ class _Hand:
         self.line = Connection(ours.detach())
 
     def ended(self) -> str:
-        """How it ended."""
+        """Return how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(_PATIENCE)
         code = self.process.returncode

@@ -113,7 +113,7 @@ class _Maker:
     max_cycles: int | None = None
 
     def settings(self) -> type:
-        """A frozen dataclass of the arguments that are numbers and names, and of `max_cycles`."""
+        """Make a frozen dataclass of the arguments that are numbers and names, and of `max_cycles`."""
         known = plain_arguments(self.signature)
         known.pop("render_mode", None)
         if self.max_cycles is not None or "max_cycles" not in known:
@@ -121,7 +121,7 @@ class _Maker:
         return as_settings("ZooSettings", known)
 
     def takes(self, name: str) -> bool:
-        """Whether it has that argument."""
+        """Return whether it has that argument."""
         parameters = self.signature.parameters
         return name in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
@@ -140,7 +140,7 @@ class _Maker:
             ) from error
 
     def own_name(self) -> str:
-        """What the environment calls itself."""
+        """Return what the environment calls itself."""
         env = self.make(self.settings()())
         told = getattr(env, "metadata", None)
         name = told.get("name") if isinstance(told, Mapping) else None

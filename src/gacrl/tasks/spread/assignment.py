@@ -29,7 +29,7 @@ _MAX_PERMUTATIONS = 120
 
 
 def assign(cost: Float[Array, "N L"]) -> Int[Array, " N"]:
-    """Landmark of each agent, such that the total cost is as small as possible.
+    """Choose the landmark of each agent, such that the total cost is as small as possible.
 
     cost: [N, L], any unit and sign. Returns the landmark's index [N], int32. With N <= L every agent gets a
     landmark of its own; with N > L each landmark gets one agent and the other agents get -1.

@@ -13,7 +13,7 @@ def assignment_potential(
     agent_mask: Bool[Array, " N"] | None = None,
     landmark_mask: Bool[Array, " L"] | None = None,
 ) -> Float[Array, ""]:
-    """Φ(s): minus the summed distance when every agent goes to the landmark that suits the team best, arena units.
+    """Return Φ(s): minus the summed distance when every agent goes to the landmark that suits the team best.
 
     It says who should go where, as the scripted oracle knows it.
     """
@@ -35,7 +35,7 @@ def potential_difference(
     discount: Float[Array, ""] | float,
     terminated: Bool[Array, "*e"],
 ) -> Float[Array, "*e"]:
-    """F(s, s′) = γ Φ(s′) − Φ(s), with Φ = 0 where nothing follows.
+    """Return F(s, s′) = γ Φ(s′) − Φ(s), with Φ = 0 where nothing follows.
 
     Discounted and summed over an episode it is γᵀ Φ(s_T) − Φ(s_0), whatever was done in between; at a time limit the
     learner's bootstrapped value stands for what Φ(s_T) has lent.

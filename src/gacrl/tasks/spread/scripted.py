@@ -48,7 +48,7 @@ ELBOW_ROOM = 0.02
 
 
 def oracle(env: Spread) -> Actor:
-    """Memory: each agent's landmark [N], fixed from the episode's first step on."""
+    """Go to one's landmark, which is the memory [N], fixed from the episode's first step on."""
     return _planner(env, lambda to_posts, posts, wanted: jnp.square(to_posts), None)
 
 

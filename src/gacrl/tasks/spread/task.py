@@ -44,7 +44,7 @@ def difficulty(settings: SpreadSettings, params: SpreadParams, share: Float[Arra
         return params
 
     def between(start: float | None, end: float | None, constant: Any) -> Any:
-        """Where one end is not configured the task's own stands; where neither is, it is constant."""
+        """Move linearly; an end that is not configured is the task's own, and without both nothing moves."""
         if start is None and end is None:
             return constant
         first, last = (constant if bound is None else bound for bound in (start, end))

@@ -23,7 +23,7 @@ def difficulty(settings: TrafficSettings, params: TrafficParams, share: Float[Ar
 
 
 def ragged(settings: TrafficSettings) -> bool:
-    """Cars arrive and leave."""
+    """Say that cars arrive and leave."""
     return True
 
 
