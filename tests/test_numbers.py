@@ -235,8 +235,14 @@ MEDIUM = {
     "the same with 200 environments": "talk-traffic-medium-exploring-2-seeds",
     "the team's reward shared": "talk-traffic-medium-shared-4-seeds",
     "the same and a teacher": "talk-traffic-medium-told-in-rounds-4-seeds",
+    "a horizon of γ .9": "talk-traffic-medium-short-horizon-3-seeds",
+    "its words silenced": "talk-traffic-medium-short-horizon-silenced",
+    "its words scrambled": "talk-traffic-medium-short-horizon-scrambled",
 }
 TRAFFIC = {
+    "the team's reward shared": "talk-traffic-easy-shared-3-seeds",
+    "its words silenced": "talk-traffic-easy-shared-silenced",
+    "its words scrambled": "talk-traffic-easy-shared-scrambled",
     "longer exploration and replay, fresh": "talk-traffic-easy-fresh-3-seeds",
     "the same, silenced": "talk-traffic-easy-fresh-silenced",
     "the same, scrambled": "talk-traffic-easy-fresh-scrambled",
