@@ -215,7 +215,7 @@ def with_self(pairs: Float[Array, "N M F"]) -> Float[Array, "N N F"]:
 
 
 def side_by_side(seen: Sequence[Float[Array, " _"]], roles: Sequence[int] | None = None) -> Float[Array, "N O"]:
-    """Lay out features of agents that see different things: each agent's numbers, padded with zeros.
+    """Lay out features of agents that see different things: numbers padded with zeros to the longest.
 
     roles: an index for each agent, appended as a one-hot, so that shared weights can tell the agents apart; by default
     every agent has a role of its own.

@@ -24,7 +24,7 @@ def restarted(fresh: Memory, memory: Memory, begins: Bool[Array, "#N"] | Bool[Ar
 def beginnings(
     first: Bool[Array, " T"], left: Bool[Array, "T N"] | None
 ) -> Bool[Array, " T"] | Bool[Array, "T N"]:
-    """Return before which of T steps memories begin anew: [T], or where lives end inside episodes [T, N].
+    """Return before which of an environment's T steps memories begin anew: [T]; where lives end inside episodes [T, N].
 
     left: whose life ended with each step. What was remembered before the first of the steps is as it should be.
     """

@@ -18,7 +18,7 @@ def closing_seconds(playing: float, more_episodes: float, frames: int) -> float:
 def seconds_left(
     env_steps: int, steps_per_second: float, evaluations: int, playing: float, closing: float
 ) -> float:
-    """Sum chunks, the evaluations after them, and what closes the run, in seconds; NaN where nothing was timed.
+    """Sum chunks, the evaluations after them, and what closes it, in whole seconds; NaN where nothing was timed.
 
     env_steps: that all seeds have still to take. evaluations: that are still to come.
     """

@@ -13,7 +13,7 @@ def assignment_potential(
     agent_mask: Bool[Array, " N"] | None = None,
     landmark_mask: Bool[Array, " L"] | None = None,
 ) -> Float[Array, ""]:
-    """Return Φ(s): minus the summed distance when every agent goes to the landmark that suits the team best.
+    """Return Φ(s): minus the summed distance when every agent goes to its landmark for the team, arena units.
 
     It says who should go where, as the scripted oracle knows it.
     """
