@@ -13,7 +13,7 @@ def assignment_potential(
     agent_mask: Bool[Array, " N"] | None = None,
     landmark_mask: Bool[Array, " L"] | None = None,
 ) -> Float[Array, ""]:
-    """Return Φ(s): minus the summed distance when every agent goes to its landmark for the team, arena units.
+    """Return Φ(s), in arena units: minus the summed distance when agents go to the landmarks that suit the team best.
 
     It says who should go where, as the scripted oracle knows it.
     """
