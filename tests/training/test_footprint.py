@@ -2,12 +2,13 @@
 
 import resource
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import pytest
 
-from gacrl.config import presets
+from gacrl.config import files, presets
 from gacrl.training import build, footprint
 
 
@@ -95,3 +96,16 @@ def test_the_plan_of_a_run_counts_its_replay():
     assert planned.bytes_per_seed == state
     assert planned.bytes_per_seed > 150_000 * 4 * 100
     assert 2 * state < planned.bytes_needed < 2.5 * state
+
+
+def test_seeds_that_take_turns_on_a_device_have_one_state_beside_theirs():
+    """Three replays lie there once: the chunk works in their place, and in a copy of the one whose turn it is."""
+    config = files.from_dict({"num_seeds": 3, "algorithm": {"replay_capacity": 30_000}}, presets.preset("vdn"))
+    one_device = build.mesh(replace(config, num_seeds=1))
+    trainer = build.make_trainer(config, one_device)
+    state = footprint.size(build.member_shapes(trainer))
+    assert build.plan(trainer, config).bytes_needed > 7 * state
+    trainer.for_speed = False
+    used = trainer.make_chunk().lower(build.stacked_shapes(trainer), 1).compile().memory_analysis()
+    assert used.alias_size_in_bytes >= 3 * state, "states are written where they were"
+    assert used.temp_size_in_bytes < 1.2 * state

@@ -38,7 +38,7 @@ class Plan:
     """Memory of a seed's training state (networks, optimiser, replay, environments)."""
     bytes_needed: int
     """Of all seeds, at the least: their states, the checkpoint being written, and what is worked on beside it; at the
-    end, the episodes that are kept to look at."""
+    end, the episodes that are kept to look at. Seeds that take turns on a device have one state more there."""
     devices: tuple[str, ...]
     num_agents: int
     max_cycles: int
@@ -128,8 +128,11 @@ def plan(trainer: AbstractTrainer, config: RunConfig) -> Plan:
     look = look_of(tasks.find(config.task), evaluated_settings(config))
     env, params = trainer.evaluation_env, trainer.evaluation_params
     recorded = footprint.recording_bytes(env, params, SHOWN_EPISODES, look)
-    states = state * config.num_seeds
-    needed = max(2 * states + working * len(devices), states + recorded)
+    places = trainer.mesh.shape["seeds"]
+    turns = -(-config.num_seeds // places)
+    states = state * turns * places
+    working += state if turns > 1 and devices[0].platform == "cpu" else 0  # a state is taken out for its turn
+    needed = max(states + state * config.num_seeds + working * len(devices), states + recorded)
     footprint.require_room(needed, devices[0])
     learned = jax.tree.leaves(trainer.algorithm.parameters(member.learner))
     return Plan(

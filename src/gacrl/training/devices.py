@@ -242,8 +242,11 @@ def _distinct(leaf: jax.Array) -> list[Any]:
     return [shard for shard in leaf.addressable_shards if shard.replica_id == 0]
 
 
-def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+def map_seeds(function: Callable[..., Any], mesh: Mesh, in_place: bool = False) -> Callable[..., Any]:
     """Make of `function(member, *shared)`, for one seed, a function of the stacked seeds.
+
+    in_place: the function returns the member as it is afterwards, and what else it has to say. Members that take turns
+    are then written where they were: beside them their replays would lie once more.
 
     Seeds are sharded over the devices. Within one device they take turns: on a CPU, mapping them instead makes
     every small matrix product a batch of them, and gains nothing (docs/design.md). What is within a seed is left to
@@ -256,6 +259,8 @@ def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
             return jax.tree.map(lambda leaf: leaf[None], result)
         if jax.default_backend() != "cpu":
             return jax.vmap(lambda member: function(member, *shared))(stacked)
+        if in_place:
+            return _one_after_another(lambda member: function(member, *shared), stacked)
         return jax.lax.map(lambda member: function(member, *shared), stacked)
 
     def on_all_devices(stacked: PyTree, *shared: PyTree) -> PyTree:
@@ -275,3 +280,13 @@ def map_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
         return jax.lax.with_sharding_constraint(mapped, NamedSharding(mesh, seeds))
 
     return on_all_devices
+
+
+def _one_after_another(function: Callable[[PyTree], tuple[PyTree, PyTree]], stacked: PyTree) -> tuple[PyTree, PyTree]:
+    """Map a function over stacked members, and put each, as it is afterwards, back into its place."""
+
+    def turn(stacked: PyTree, number: jax.Array) -> tuple[PyTree, PyTree]:
+        member, shown = function(jax.tree.map(lambda leaf: leaf[number], stacked))
+        return jax.tree.map(lambda leaf, new: leaf.at[number].set(new), stacked, member), shown
+
+    return jax.lax.scan(turn, stacked, jnp.arange(jax.tree.leaves(stacked)[0].shape[0]))

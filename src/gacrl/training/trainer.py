@@ -282,7 +282,8 @@ class Trainer(AbstractTrainer):
     def make_chunk(self) -> Any:
         """Return the program, not yet compiled."""
         options = compiler_options(self.for_speed, self.algorithm.library_sums)
-        return jax.jit(map_seeds(self.chunk_of_one, self.mesh), donate_argnums=0, compiler_options=options)
+        chunk = map_seeds(self.chunk_of_one, self.mesh, in_place=True)
+        return jax.jit(chunk, donate_argnums=0, compiler_options=options)
 
     def compiled(self, state: TrainState, num_updates: int) -> Chunk:
         """Compile a chunk of any length."""
