@@ -282,7 +282,9 @@ def map_seeds(function: Callable[..., Any], mesh: Mesh, in_place: bool = False) 
     return on_all_devices
 
 
-def _one_after_another(function: Callable[[PyTree], tuple[PyTree, PyTree]], stacked: PyTree) -> tuple[PyTree, PyTree]:
+def _one_after_another(
+    function: Callable[[PyTree], tuple[PyTree, PyTree]], stacked: PyTree
+) -> tuple[PyTree, PyTree]:
     """Map a function over stacked members, and put each, as it is afterwards, back into its place."""
 
     def turn(stacked: PyTree, number: jax.Array) -> tuple[PyTree, PyTree]:
