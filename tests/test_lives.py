@@ -1,4 +1,4 @@
-"""Lives that end inside an episode: no value is bootstrapped across one, and who takes the slot remembers nothing."""
+"""What ends before its time: lives inside an episode, across which no value is bootstrapped, and episodes themselves."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ import pytest
 
 from gacrl import Environment, TimeStep, observe, rollout
 from gacrl.algorithms import build
-from gacrl.config.algorithms import IppoConfig, IqlConfig, NetworkConfig
+from gacrl.config.algorithms import IppoConfig, IqlConfig, NetworkConfig, VdnConfig
 from gacrl.config.run import TrainingConfig
 from gacrl.training.curriculum import constant
 from gacrl.training.trainer import Trainer
@@ -94,3 +94,45 @@ def test_who_takes_a_slot_remembers_nothing():
     own, team = found.transitions.decision.extras
     np.testing.assert_array_equal(own[:, 0, :, 0].T, [[0, 1, 0, 1, 0, 0, 1, 0], [0, 0, 1, 0, 1, 0, 0, 1]])
     np.testing.assert_array_equal(team[:, 0], [0, 1, 2, 3, 4, 0, 1, 2])
+
+
+@dataclass(frozen=True)
+class Errand(Environment):
+    """Every step costs 1, until the first agent ends it: by its second action."""
+
+    num_agents: int = 2
+    num_actions: int = 2
+    observation_size: int = 1
+    max_cycles: int = 7
+
+    def reset(self, key: Any, params: Any = ()) -> Any:
+        return jnp.zeros((), jnp.int32), observe(jnp.ones((2, 1)), num_actions=2)
+
+    def step(self, state: Any, action: Any, key: Any, params: Any = ()) -> Any:
+        seen, over = observe(jnp.ones((2, 1)), num_actions=2), action[0] == 1
+        return state + 1, TimeStep(seen, -jnp.ones(2), over, ~over & (state + 1 >= self.max_cycles), {})
+
+
+def test_a_task_that_costs_the_same_in_every_step_is_ended_at_once():
+    """With the reward's mean taken off there would be nothing to learn from: −1 as ever, 0 from what is expected."""
+    config = VdnConfig(
+        network=NetworkConfig(width=8, depth=1, recurrent=False),
+        gamma=GAMMA,
+        learning_rate=1e-2,
+        learning_rate_end=1e-2,
+        learning_starts=0,
+        batch_size=32,
+        updates=4,
+        target_step=0.1,
+        replay_capacity=2_000,
+        sequence_length=1,
+        reward_norm=True,
+    )
+    env, training = Errand(), TrainingConfig(env_steps=8 * 7 * 100, num_envs=8, num_steps=7)
+    algorithm = build.make(config, env, training)
+    trainer = Trainer(algorithm, env, constant(), training.num_envs, training.num_steps)
+    state, _ = trainer.chunk(trainer.init((0,)), 100)
+    policy = algorithm.policy(jax.tree.map(lambda leaf: leaf[0], state.learner), False)
+    decision, _ = policy(trainer.memory, env.reset(jax.random.key(0))[1], jax.random.key(0))
+    assert decision.action[0] == 1
+    np.testing.assert_allclose(decision.extras["value"], -1.0, atol=0.05)

@@ -77,12 +77,14 @@ class Case(NamedTuple):
     time_limits: tuple[int, ...] = (3,)
     unknown: int | None = None
     """A time limit too many: its own value stands in for what followed."""
+    ends: bool = True
+    """The task ends at step 1."""
     lives: bool = False
     """The first agent's life ends at step 2, and another one takes its slot."""
 
 
 def hand_made(steps: int, case: Case) -> Rollout:
-    """One environment: the task ends at step 1. What followed the last step of an episode stands apart."""
+    """One environment. What followed the last step of an episode stands apart."""
     rng = np.random.default_rng(7)
     _, observation = ENV.reset(jax.random.key(0))
     seen, after = (
@@ -92,7 +94,7 @@ def hand_made(steps: int, case: Case) -> Rollout:
         for seed in (1, 2)
     )
     end = np.arange(steps)[:, None]
-    terminated, truncated = end == 1, np.isin(end, case.time_limits)
+    terminated, truncated = (end == 1) & case.ends, np.isin(end, case.time_limits)
     done = terminated | truncated
     going_on = ~(done | (end == steps - 1))[..., None, None]
     after = after._replace(features=jnp.where(going_on, jnp.roll(seen.features, -1, axis=0), after.features))
@@ -122,8 +124,10 @@ def expected_errors(case: Case, given: Rollout, scale: float, target_scale: floa
     team = case.mixer != "iql"
     if case.reward_norm:  # one step of the running moments: the batch's own
         earned = reward[:, REAL].mean(1) if team else reward[:, REAL]
-        mean = 0.0 if case.lives and not team else earned.mean()  # or it would pay for a longer life
-        reward = (reward[:, REAL] - mean) / earned.std()
+        mean, unit = earned.mean(), earned.std()
+        if case.ends or (case.lives and not team):  # or it would pay for a longer episode, or life
+            mean, unit = 0.0, max(abs(mean), unit)
+        reward = (reward[:, REAL] - mean) / unit
         reward = np.concatenate([reward, np.zeros((len(reward), 1))], axis=1)
     left = np.zeros((len(here), N), bool) if steps.left is None else steps.left
     carry, errors = np.full(N, 2.0), []
@@ -162,6 +166,7 @@ CASES = {
     "IQL, one step": Case("iql", 1, 1, False),
     "IQL, three steps, not double": Case("iql", 3, 4, False, double_q=False),
     "VDN, three steps, recurrent, normed": Case("vdn", 3, 4, True, reward_norm=True),
+    "VDN, normed, without an end": Case("vdn", 3, 4, False, reward_norm=True, ends=False),
     "IQL, three steps, recurrent, not double": Case("iql", 3, 4, True, double_q=False),
     "VDN, recurrent, with time limits sooner than the task says": Case(
         "vdn", 3, 4, True, time_limits=(0, 2, 3), unknown=3

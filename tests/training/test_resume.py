@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ import pytest
 import safetensors.numpy
 from conftest import TinyRun
 
+from gacrl.algorithms import objectives
 from gacrl.algorithms.replay import Replay
 from gacrl.cli.main import main
 from gacrl.config import files as configuration
@@ -235,6 +236,12 @@ STATE = {
 TENSORS = checkpoint.serialise(checkpoint.arrays(STATE))
 
 
+class LearnedRewards(NamedTuple):
+    """The part of a learner that knows what rewards are like."""
+
+    rewards: Any
+
+
 def saved(folder: Path, env_steps: int = 30) -> Path:
     return checkpoint.save(folder, TENSORS, env_steps, "fingerprint", {"wall": 1.5})
 
@@ -278,6 +285,14 @@ def test_a_part_of_a_state_can_be_loaded(tmp_path: Path):
     found, _ = checkpoint.newest(tmp_path)
     loaded = checkpoint.load(found, STATE, prefix="['learner']")
     np.testing.assert_array_equal(loaded["weights"], STATE["weights"])
+
+
+def test_a_state_from_before_rewards_knew_of_ends_is_read(tmp_path: Path):
+    now = LearnedRewards(objectives.no_rewards()._replace(moments=objectives.ValueNorm(*jnp.arange(3.0))))
+    before = LearnedRewards(now.rewards.moments)
+    checkpoint.save(tmp_path, checkpoint.serialise(checkpoint.arrays(before)), 1, "", {})
+    loaded = checkpoint.load(checkpoint.newest(tmp_path)[0], now)
+    jax.tree.map(np.testing.assert_array_equal, loaded, now)
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,29 @@ class ValueNorm(NamedTuple):
         return values * self.sd + self.mean
 
 
+class RewardNorm(NamedTuple):
+    """Rewards in a unit of their own, and around 0 where that leaves the optimum as it is."""
+
+    moments: ValueNorm
+    ended: Bool[Array, ""]
+    """Whether an episode has ended by itself so far, not by its time limit."""
+
+    def normalise(self, reward: Float[Array, "*b"], lives: bool) -> Float[Array, "*b"]:
+        """Return rewards in standard deviations around the mean.
+
+        Where episodes end by themselves, or values with the lives of agents inside them (lives), the mean stays, and
+        the unit is no less than it. Taken off, it would pay, or fine, every step that an end puts off: where each step
+        costs the same, nothing would be left to learn from.
+        """
+        unit = jnp.maximum(self.moments.sd, jnp.abs(self.moments.mean))
+        return jnp.where(self.ended | lives, reward / unit, self.moments.normalise(reward))
+
+
+def no_rewards() -> RewardNorm:
+    """Return what was found of rewards before any was seen: normalising changes nothing."""
+    return RewardNorm(no_returns(), jnp.zeros((), bool))
+
+
 def no_returns() -> ValueNorm:
     """Return the moments before any return was seen: normalising changes nothing."""
     zero = jnp.zeros(())

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from gacrl.algorithms import replay as ring
 from gacrl.algorithms.actions import ActionSet
 from gacrl.algorithms.exploration import Exploration
-from gacrl.algorithms.objectives import ValueNorm
+from gacrl.algorithms.objectives import RewardNorm
 from gacrl.algorithms.shared import mean_real
 from gacrl.config.algorithms import QLearningConfig
 from gacrl.envs.environment import Environment
@@ -46,7 +46,7 @@ def message_loss(output: AgentOutput, observation: Observation) -> Metrics:
 
 
 class Parts(NamedTuple):
-    """What makes a learner out of this file."""
+    """What makes a learner out of Q-learning (`q_learning.make`)."""
 
     networks: Callable[[PRNGKey], Network]
     team_value: TeamValue
@@ -58,7 +58,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """What is settled before anything is learned: constants of every function below."""
+    """What is settled before anything is learned: constants of every function of Q-learning."""
 
     config: QLearningConfig
     env: Environment
@@ -131,8 +131,8 @@ class LearnerState(NamedTuple):
     optimizer: optax.OptState
     replay: ring.Replay[Float[Array, "capacity E W"]]
     """Of experiences, each packed into one vector."""
-    rewards: ValueNorm
-    """Running moments of the reward."""
+    rewards: RewardNorm
+    """Running moments of the reward, and whether episodes end by themselves."""
     exploration: Any
     env_steps: Int[Array, ""]
     hyper: Hyper

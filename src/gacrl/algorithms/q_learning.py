@@ -20,7 +20,7 @@ from gacrl.algorithms.actions import choices, greedy
 from gacrl.algorithms.augmentation import play, require_no_memory_in_symmetric_play, turn_experience
 from gacrl.algorithms.contract import Algorithm
 from gacrl.algorithms.exploration import Exploration, progress_between
-from gacrl.algorithms.objectives import ValueNorm, follow_returns, no_returns
+from gacrl.algorithms.objectives import RewardNorm, follow_returns, no_rewards
 from gacrl.algorithms.q_learner import ActMemory, Experience, Hyper, LearnerState, Network, Parts, Setup
 from gacrl.algorithms.q_loss import loss
 from gacrl.algorithms.shared import clipped_adam, share_reward
@@ -108,7 +108,7 @@ def init(q: Setup, key: PRNGKey, hyper: Hyper) -> LearnerState:
         target=network,
         optimizer=q.adam.init(network),  # pyright: ignore[reportArgumentType] a module is a pytree
         replay=ring.empty(jnp.zeros((q.num_envs, ring.packing(partial(example, q))[0])), q.rows),
-        rewards=no_returns(),
+        rewards=no_rewards(),
         exploration=q.explorer.init(),
         env_steps=jnp.zeros((), jnp.int32),
         hyper=jax.tree.map(lambda number: jnp.asarray(number, float), hyper),
@@ -154,14 +154,14 @@ def policy(q: Setup, learner: LearnerState, explore: bool) -> Policy:
         before, mode = remembered.network, remembered.exploration
         if explore:
             output, after = network.agent(observation, before, talk_key, level.temperature)
-            mode, epsilon = q.explorer.begin(mode, mode_key, level.epsilon)
-            available = q.actions.mask(observation.action_mask)
-            choice = epsilon_greedy(action_key, output.head, available, epsilon)
         else:
             symmetric = q.config.symmetric_play
             output, after = play(q.env, symmetric, network.agent, observation, before, level.temperature)
-            choice = greedy(output.head, q.actions.mask(observation.action_mask))
-        best = greedy(output.head, q.actions.mask(observation.action_mask))
+        available = q.actions.mask(observation.action_mask)
+        choice = best = greedy(output.head, available)
+        if explore:
+            mode, epsilon = q.explorer.begin(mode, mode_key, level.epsilon)
+            choice = epsilon_greedy(action_key, output.head, available, epsilon)
         extras = {
             "value": jnp.broadcast_to(value_now(q, network, output, best, observation), choice.shape),
             "choice": choice,
@@ -188,14 +188,15 @@ def value_now(
 
 
 def remember(q: Setup, learner: LearnerState, steps: Transition) -> LearnerState:
-    """Take in a rollout [T, E, …]: the replay, the moments of the reward, and what exploration follows."""
+    """Take in a rollout [T, E, …]: the replay, what rewards are like, and what exploration follows."""
     kept = steps._replace(decision=Decision(steps.decision.extras["choice"]), info={})
     block = Experience(kept, steps.decision.extras["memory"])
     replay = ring.add_block(learner.replay, jax.vmap(jax.vmap(ring.pack))(block))
     rewards = learner.rewards
     if q.config.reward_norm:
         earned = share_reward(steps, q.shares_reward)
-        rewards = follow_returns(rewards, earned, steps.observation.agent_mask)
+        moments = follow_returns(rewards.moments, earned, steps.observation.agent_mask)
+        rewards = RewardNorm(moments, rewards.ended | steps.terminated.any())
     env_steps = learner.env_steps + q.num_envs * q.num_steps
     exploration = q.explorer.follow(learner.exploration, steps)
     return learner._replace(replay=replay, rewards=rewards, exploration=exploration, env_steps=env_steps)
@@ -205,7 +206,7 @@ class Standing(NamedTuple):
     """What stays as it is during an update."""
 
     replay: ring.Replay[Float[Array, "capacity E W"]]
-    rewards: ValueNorm
+    rewards: RewardNorm
     learning_rate: Float[Array, ""]
     target_step: Float[Array, ""] | float
 

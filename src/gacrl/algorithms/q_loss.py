@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from gacrl.algorithms.actions import greedy
-from gacrl.algorithms.objectives import HUBER_DELTA, ValueNorm, huber
+from gacrl.algorithms.objectives import HUBER_DELTA, RewardNorm, huber
 from gacrl.algorithms.q_learner import Experience, LearnerState, Network, Setup
 from gacrl.algorithms.returns import n_step_window, next_values
 from gacrl.algorithms.shared import share_reward
@@ -111,7 +111,7 @@ def following(
 
 
 def window_loss(
-    q: Setup, pair: Pair, gamma: Float[Array, ""] | float, rewards: ValueNorm, heard: Transition, looks: Looks
+    q: Setup, pair: Pair, gamma: Float[Array, ""] | float, rewards: RewardNorm, heard: Transition, looks: Looks
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the loss on one window [W, …] of one environment."""
     network, learned = pair.network, q.config.sequence_length
@@ -140,14 +140,11 @@ def window_loss(
     return td + sum(auxiliary.values(), jnp.zeros(())), metrics
 
 
-def team_or_own(q: Setup, rewards: ValueNorm, seen: Transition) -> Float[Array, "W N"]:
-    """Return the rewards to learn from: the team's for everyone, or each agent's own.
-
-    They are scaled by the running standard deviation. The mean is taken off as well, but not where an agent's value
-    ends with its life, inside an episode: there it would pay, or fine, agents for every step that they stay.
-    """
-    reward = share_reward(seen, q.shares_reward)
-    return reward / rewards.sd if q.parts.own_values and seen.left is not None else rewards.normalise(reward)
+def team_or_own(q: Setup, rewards: RewardNorm, seen: Transition) -> Float[Array, "W N"]:
+    """Return the normalised rewards to learn from: the team's for everyone, or each agent's own."""
+    return rewards.normalise(
+        share_reward(seen, q.shares_reward), lives=q.parts.own_values and seen.left is not None
+    )
 
 
 class Ends(NamedTuple):
@@ -183,7 +180,7 @@ def window_targets(
 
 
 def loss(
-    q: Setup, network: Network, learner: LearnerState, rewards: ValueNorm, batch: Experience, keys: Array
+    q: Setup, network: Network, learner: LearnerState, rewards: RewardNorm, batch: Experience, keys: Array
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the mean over windows [W, B, …]."""
     level = q.explorer.level(learner.exploration, learner.env_steps)

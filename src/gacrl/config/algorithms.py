@@ -309,7 +309,7 @@ class QLearningConfig(LearningConfig):
     """The target network moves this far towards the online one after each gradient step."""
     reward_norm: bool = False
     """Learn from rewards in units of their running mean and standard deviation, which keeps values around 0 (a
-    monotonic mixer's units saturate far below it). Leaves the optimum where episodes have a fixed length."""
+    monotonic mixer's units saturate far below it). Once an episode has ended by itself the mean stays where it is."""
     double_q: bool = True
     """The online network chooses the action that the target network values."""
     averaged: bool = False

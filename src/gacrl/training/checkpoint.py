@@ -30,8 +30,10 @@ STEP, BEST = "step-", "best-"
 KEPT = {STEP: 2, BEST: 1}
 """Newest of each kind that stay; of the whole states the one before is there should the newest be damaged."""
 
-FORMERLY = {".exploration.progress": ".exploration.coverage"}
-"""What an array was called in checkpoints of version 0.1.0."""
+FORMERLY = {".exploration.progress": ".exploration.coverage", ".rewards.moments.": ".rewards."}
+"""What an array was called in older checkpoints."""
+NEW = (".rewards.ended",)
+"""Arrays that older checkpoints have not: they are zeros there."""
 
 _TENSORS, _MANIFEST, _UNFINISHED, _DAMAGED = "state.safetensors", "manifest.json", ".unfinished-", ".damaged-"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, RecursionError, safetensors.SafetensorError)
@@ -164,7 +166,7 @@ def load(checkpoint: Checkpoint, like: Tree, prefix: str = "", replay: Replay[An
                 name = name if name in saved else name.replace(now, before)
             is_key = _is_key(leaf)
             wanted = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
-            found = None
+            found = np.zeros(wanted.shape, wanted.dtype) if name.endswith(NEW) else None
             if name in saved:
                 with contextlib.suppress(AttributeError, TypeError):  # numbers of a kind that NumPy has not
                     found = file.get_tensor(name)
