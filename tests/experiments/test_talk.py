@@ -86,6 +86,7 @@ def test_the_command_in_the_report_is_the_one_that_was_given():
     flags = words[words.index("--env.num-agents") :]
     assert parsing.changed(usual.env, flags, "talk", arguments.Talk) == config.env
     assert "--env." not in talk._command(usual)
+    assert "--env spread" in talk._command(configuration.preset("gacrl")), "without a task it is the study of all"
 
 
 def test_what_cannot_talk_is_refused(tmp_path: Path):

@@ -16,6 +16,7 @@ from gacrl.config.run import RunConfig
 from gacrl.experiments import scoring, talk
 from gacrl.experiments.talking import cells, kinds, known
 from gacrl.experiments.talking import study as of_all
+from gacrl.tasks import own
 from gacrl.tasks.task import HEADLINE
 from gacrl.training import session
 from gacrl.training.divergence import Diverged
@@ -27,7 +28,8 @@ CASE = tasks.find("reference").cases["reference"]
 STEPS = (100, 200, 300, 400)
 RETURNS = {"none": -18.0, "told": -8.0, "discrete": -9.0, "tarmac": -30.0}
 """Of the learners, by their messages: the seeds lie around it by 0.1."""
-KNOWN = Path(__file__).parents[2] / "docs" / "data" / "talk-reference-study.json"
+ROOT = Path(__file__).parents[2]
+KNOWN = ROOT / "docs" / "data" / "talk-reference-study.json"
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +186,31 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
     assert "10 seeds from 0, 512 episodes" in written and command in written
 
 
+def test_the_committed_study_of_a_task_of_ones_own_is_read():
+    """Its measures have no metrics: the tables show them by their own names."""
+    own.bring(f"{ROOT / 'examples' / 'own_task.py'}:Beacon")
+    file = ROOT / "docs" / "data" / "talk-beacon-study.json"
+    held = json.loads(file.read_text(encoding="utf-8"))
+    found = known.read(file, configuration.from_dict(held["config"]))
+    assert found.finals["told"][HEADLINE].tolist() == held["returns"]["told"]
+    for label, measured in held["further"].items():
+        assert found.finals["silent"][label].tolist() == measured["silent"]
+
+
+def test_no_score_runs_from_a_good_silent_policy_down_to_a_worse_told_one():
+    """The junction's scripted ends are those that never brake, and those that know where all cars are."""
+
+    def scores(gas: float, yielder: float) -> object:
+        scripted = {
+            who: {"success": worth} for who, worth in (("random", 0.0), ("gas", gas), ("yielder", yielder))
+        }
+        junction = tasks.find("traffic_junction")
+        return cells.Played("", junction, junction.cases["traffic_junction"], scripted, {}).scores(np.array([0.6]))
+
+    assert scores(0.2, 1.0) == pytest.approx([0.5])
+    assert scores(0.3, 0.2) is None
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -199,6 +226,10 @@ def test_what_was_trained_before_is_read_and_not_trained(trained: list[RunConfig
         (["--env", "reference", "--kinds", "dial"], "--kinds is for the study of all tasks: leave --env out"),
         (["--env", "reference", "--known", "none.json"], "cannot read none.json"),
         (["--env", "reference", "--known", str(KNOWN), "--env-steps", "10"], "only of reference (40,000 steps)"),
+        (
+            ["--env", "reference", "--env.talk", "actions"],
+            "reference has words among its actions there, and no messages",
+        ),
         (["--env", "spread", "--env.num-agents", "1"], "spread has a single agent: nobody is there to talk to"),
     ],
 )

@@ -341,6 +341,11 @@ def test_agents_that_there_are_not_are_refused_in_one_sentence(text: str, strang
         assert re.fullmatch(sentence, str(caught.value))
 
 
+def test_a_list_of_nobody_silences_nobody_and_is_refused():
+    with pytest.raises(ConfigError, match="silence: name an agent, or give no list to silence all"):
+        interventions.silence([])
+
+
 def test_a_single_episode_cannot_be_scrambled():
     for play in (evaluate, record_many):
         with pytest.raises(ConfigError) as caught:

@@ -38,7 +38,10 @@ from gacrl.types import Decision, Memory, Metrics, Observation, Policy, PRNGKey,
 def make(
     config: QLearningConfig, env: Environment, training: TrainingConfig, progress: str | None, parts: Parts
 ) -> Algorithm:
-    """Make the learner for this task's shapes. progress: the measure that exploration may follow."""
+    """Make the learner for this task's shapes. progress: the measure that exploration may follow.
+
+    Raises ConfigError for an intervention in training where nothing is said, and for symmetric play with a memory.
+    """
     explore: Callable[..., Exploration] = resolve(EXPLORATION[config.exploration])
     network = eqx.filter_eval_shape(parts.networks, jax.random.key(0))
     q = Setup(
@@ -70,7 +73,9 @@ def make(
         acting=acting,
         network=None if config.symmetric_play else partial(playing, config.averaged),
         parameters=lambda learner: learner.network,
-        learned=lambda learner: learner._replace(**dict.fromkeys(LearnerState._fields[2:], ())),
+        learned=lambda learner: learner._replace(
+            optimizer=(), replay=(), rewards=(), exploration=(), env_steps=(), hyper=()
+        ),
         replay=lambda learner: learner.replay,
         batch_steps=config.batch_size * q.window,
         library_sums=config.network.recurrent and not network.agent.communication.heard_late,

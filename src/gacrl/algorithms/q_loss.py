@@ -127,7 +127,7 @@ def window_loss(
     value = jax.vmap(lambda *now: q.parts.team_value(network, *now))(online, now.decision.action, now.observation)
     reward = team_or_own(q, rewards, seen)[:, : value.shape[-1]]
     error = value - jax.lax.stop_gradient(window_targets(q, reward, future, ends, gamma))
-    real = now.observation.agent_mask if error.shape[-1] > 1 else jnp.ones(error.shape, bool)
+    real = now.observation.agent_mask if q.parts.own_values else jnp.ones(error.shape, bool)
     td = jnp.where(real, huber(error, HUBER_DELTA), 0.0).sum() / jnp.maximum(real.sum(), 1)
     auxiliary = {}
     if looks.pupil is not None:

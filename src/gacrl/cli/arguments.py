@@ -451,7 +451,7 @@ class Ablate:
 class Talk:
     """Train silent, talking and told agents on a task, and say whether it needs talk and whether the agents use it.
 
-    The three are equally large and train for equally many steps; told agents hear all that their neighbours see. Then
+    The three are about as large and train for as many steps; told agents hear all that their neighbours see. Then
     the talking ones play with their messages silenced, scrambled and delayed. Stopped or killed, the same command
     resumes with what is missing.
 

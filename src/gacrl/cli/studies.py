@@ -136,7 +136,10 @@ def _talk_of_all(words: Words) -> int:
     out = asked.out or Path("runs") / "talk"
 
     def work(watch: "Watch") -> "TalkOfAll | None":
-        return study.study(config, out, asked.seeds, asked.scale, asked.trials, asked.tasks, asked.kinds, watch)
+        use = [Path(file) for file in words.named.get("--use", ())]
+        return study.study(
+            config, out, asked.seeds, asked.scale, asked.trials, asked.tasks, asked.kinds, watch, use
+        )
 
     return _studied(work, out, asked.json, _print_scores)
 
@@ -161,7 +164,7 @@ def _print_answer(done: "Talk") -> None:
     screen = console()
     title = f"random agents earn {done.answer.random:.2f}"
     for label, measured in done.measured.items():
-        rows = [[name, *talk.cells(values)] for name, values in measured.items()]
+        rows = [[name, *talk.with_every_seed(values)] for name, values in measured.items()]
         print_table(screen, ("", label, "every seed"), rows, title)
         title = ""
     say(screen, done.sentence)

@@ -10,6 +10,7 @@ import numpy as np
 from gacrl import tasks
 from gacrl.adapters import mpe2
 from gacrl.config.checks import require, whole
+from gacrl.config.run import RunConfig
 from gacrl.envs.environment import Environment, EnvParams
 from gacrl.errors import UserError
 from gacrl.evaluation import episodes as recording
@@ -83,6 +84,8 @@ def score_run(
         require(
             not utter or intervention is None, "what is uttered arrives: leave --utter or the intervention out"
         )
+        if utter:
+            _require_utterable(opened.task, opened.config)
         done = _in_backend(backend, intervention, opened.trainer.intervention, warn)
         played = Played(opened.task, opened.config.env)
         _require_room(played, episodes, opened.trainer.memory)
@@ -165,6 +168,16 @@ def _scripted_task(run: str, task: str, change: Change) -> Played | None:
     if run not in references.playable(found):
         return None
     return Played(found, change(tasks.default_settings(task)))
+
+
+def _require_utterable(task: Task, config: RunConfig) -> None:
+    """Raise UserError where the task has no utterances, or what agents say is no word in every step."""
+    if task.uttered is None:
+        raise UserError(f"{task.name} has no utterances among its actions: leave --utter out")
+    network = getattr(config.algorithm, "network", None)
+    if network is not None and (network.gate or not kind_of(network).sends_symbols):
+        says = "may say nothing" if network.gate else f"send {network.communication}"
+        raise UserError(f"only symbols in every step can be uttered, and these agents {says}: leave --utter out")
 
 
 def _messages(opened: TrainedRun) -> dict[str, float] | None:
@@ -261,9 +274,7 @@ def _member(
         opened.trainer.memory,
         stream_key("report"),
     )
-    if utter:
-        if opened.task.uttered is None:
-            raise UserError(f"{opened.task.name} has no utterances among its actions: leave --utter out")
+    if utter and opened.task.uttered is not None:
         env, policy = opened.task.uttered(env, policy)
     if backend == "mpe2":
         return mpe2.evaluate(env, policy, memory, key, episodes)

@@ -11,8 +11,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
@@ -36,10 +34,9 @@ from gacrl.experiments.study import (
     refuse_other_settings,
     train_missing,
 )
-from gacrl.experiments.talking.cells import CAUGHT
-from gacrl.experiments.talking.kinds import hears_by, num_parameters, talker
+from gacrl.experiments.talking.cells import CAUGHT, play
+from gacrl.experiments.talking.kinds import KIND_OF, hears_by, num_parameters, talker
 from gacrl.experiments.talking.known import Known, read
-from gacrl.messages import interventions
 from gacrl.replacing import replace_json
 from gacrl.report import figures
 from gacrl.report.page import Page
@@ -53,7 +50,6 @@ _HEARD: Mapping[str, str] = MappingProxyType(
         TOLD: "agents hear what their neighbours see",
     }
 )
-_KINDS: Mapping[str, str] = MappingProxyType({SILENT: "none", TALKING: "discrete", TOLD: "told"})
 SENT, SCRAMBLED = "as sent", "scrambled"
 PLAYED: Mapping[str, str] = MappingProxyType({SENT: "", **CAUGHT})
 """What happens to the talking learner's messages, and the intervention that does it."""
@@ -168,9 +164,10 @@ def talk(
 ) -> Talk | None:
     """Train what is missing under `out`, play it, and write `report.html`, `report.md` and `summary.json` there.
 
-    config: of the talking learner. known: a file of silent and told learners, which then are not trained. Returns None
-    where the watcher's stop ended it early. Raises UserError for fewer than two seeds, a single agent, a preset whose
-    agents cannot talk, a file without those learners, or a folder that holds something else.
+    config: of the talking learner. seeds: of each. env_steps: of each seed. known: a file of silent and told learners,
+    which then are not trained. Returns None where the watcher's stop ended it early. Raises UserError for fewer than
+    two seeds, a single agent, words that are actions, a preset whose agents cannot talk, a file without those learners,
+    or a folder that holds something else.
     """
     watch = watch or Watch()
     if seeds < 2:
@@ -195,7 +192,7 @@ def talk(
 def plan(config: RunConfig, out: Path) -> list[Planned]:
     """Plan the three learners. The silent and the told one are as large as the talking one."""
     parameters = num_parameters(config)
-    return [Planned(name, hears_by(_KINDS[name], config, parameters), out / name) for name in LEARNERS]
+    return [Planned(name, hears_by(KIND_OF[name], config, parameters), out / name) for name in LEARNERS]
 
 
 def answer(returns: Finals, played: Finals, random: float) -> Answer:
@@ -215,11 +212,12 @@ def _read(out: Path, runs: Sequence[Planned], known: Known | None) -> Talk:
             raise UserError(f"there is no answer: the {run.name} learner {because}")
     [(config, talking)] = [(run.config, run.folder) for run in runs if run.name == TALKING]
     episodes = config.evaluation.final_episodes
-    found = {run.name: _played(run.folder, episodes) for run in runs} | dict(known.finals if known else {})
+    found = {run.name: play(run.folder, episodes) for run in runs} | dict(known.finals if known else {})
     greedy = {name: found[name] for name in LEARNERS}
-    caught = {name: _played(talking, episodes, how) if how else greedy[TALKING] for name, how in PLAYED.items()}
+    caught = {name: play(talking, episodes, how) if how else greedy[TALKING] for name, how in PLAYED.items()}
     every = {**greedy, **{f"{TALKING}, {name}": values for name, values in caught.items() if name != SENT}}
-    shown = tasks.find(config.task).shown(list(greedy[TALKING]))
+    shared = [metric for metric in greedy[TALKING] if all(metric in values for values in greedy.values())]
+    shown = tasks.find(config.task).shown(shared)
     further = {
         label: {name: values[metric] for name, values in every.items()}
         for metric, label in shown.items()
@@ -235,44 +233,12 @@ def _read(out: Path, runs: Sequence[Planned], known: Known | None) -> Talk:
     return Talk(out, out / "report.html", config, parameters, returns, played, judged, further, made, known)
 
 
-def _played(run: Path, episodes: int, intervention: str = "") -> dict[str, Values]:
-    """Every metric of each seed [S], greedy."""
-    played = scoring.play(str(run), episodes, intervention=interventions.parse(intervention))
-    return {metric: np.asarray(values.mean(1), float) for metric, values in played.items()}
-
-
 def _report(done: Talk) -> Page:
-    page, config = Page(f"Does {done.task.name} need talk?"), done.config
+    page = Page(f"Does {done.task.name} need talk?")
     page.text(done.sentence)
     for sentence in doubts(done.made_by):
         page.text(sentence)
-    page.table(
-        ("learner", "what agents hear", "parameters", "return per agent", "every seed"),
-        [
-            [name, _HEARD[name], f"{done.parameters[name]:,}", *cells(values)]
-            for name, values in done.returns.items()
-        ],
-        f"{config.preset} on {done.task.name}: {config.training.env_steps:,} environment steps a seed, "
-        f"{config.num_seeds} seeds from {config.seed}. Return of {config.evaluation.final_episodes} fixed episodes, "
-        f"greedy, last parameters; mean over seeds and its 95 % bootstrap interval. Random agents: "
-        f"{done.answer.random:.2f}."
-        + (f" Silent and told agents are those of {done.known.says}." if done.known else ""),
-    )
-    page.table(
-        ("messages", "return per agent", "every seed"),
-        [[name, *cells(values)] for name, values in done.played.items()],
-        "The same talking agents, by what happens to their messages. Scrambled: every agent is heard with its words "
-        "from another episode.",
-    )
-    page.text(
-        f"A talking seed earns more than a silent one with probability {with_interval(done.improvement, '.2f')}."
-    )
-    for label, measured in done.further.items():
-        page.table(
-            ("", label, "every seed"),
-            [[name, *cells(values)] for name, values in measured.items()],
-            "The same episodes.",
-        )
+    _tables(page, done)
     label, earned = next(iter(done.measured.items()))
     page.figure(
         figures.dots(
@@ -286,19 +252,52 @@ def _report(done: Talk) -> Page:
     )
     page.heading("How this is judged")
     page.text(
-        "A task needs talk where the lower bound of told − silent is above 5 % of what silent agents gain over random "
-        "ones. Agents use talk where the lower bound of as sent − scrambled is above 5 % of told − silent."
+        f"A task needs talk where the lower end of the interval of told − silent is above {100 * MATTERS:g} % of what "
+        "silent agents gain over random ones. Agents use talk where the lower end of the interval of as sent − "
+        f"scrambled is above {100 * MATTERS:g} % of told − silent."
     )
-    page.code(_command(config, done.known))
+    page.code(_command(done.config, done.known))
     page.text(code_of(done.made_by))
     return page
+
+
+def _tables(page: Page, done: Talk) -> None:
+    """What the learners came to, what their messages were worth, and the other metrics."""
+    config = done.config
+    page.table(
+        ("learner", "what agents hear", "parameters", "return per agent", "every seed"),
+        [
+            [name, _HEARD[name], f"{done.parameters[name]:,}", *with_every_seed(values)]
+            for name, values in done.returns.items()
+        ],
+        f"{config.preset} on {done.task.name}: {config.training.env_steps:,} environment steps a seed, "
+        f"{config.num_seeds} seeds from {config.seed}. Return of {config.evaluation.final_episodes} fixed episodes, "
+        f"greedy, last parameters; mean over seeds and its 95 % bootstrap interval. Random agents: "
+        f"{done.answer.random:.2f}."
+        + (f" Silent and told agents are those of {done.known.says}." if done.known else ""),
+    )
+    page.table(
+        ("messages", "return per agent", "every seed"),
+        [[name, *with_every_seed(values)] for name, values in done.played.items()],
+        "The same talking agents, by what happens to their messages. Scrambled: every agent is heard with its words "
+        "from another episode.",
+    )
+    page.text(
+        f"A talking seed earns more than a silent one with probability {with_interval(done.improvement, '.2f')}."
+    )
+    for label, measured in done.further.items():
+        page.table(
+            ("", label, "every seed"),
+            [[name, *with_every_seed(values)] for name, values in measured.items()],
+            "The same episodes.",
+        )
 
 
 def _command(config: RunConfig, known: Known | None = None) -> str:
     """Write what repeats the study: the flags, and the settings of the task that are not as usual."""
     usual = configuration.on_task(configuration.preset(config.preset), config.task).env
     words = [
-        f"gacrl talk{tasks.flag(config.task, as_given=True)}",
+        f"gacrl talk{tasks.flag(config.task, as_given=True) or f' --env {config.task}'}",
         f"--preset {config.preset}",
         f"--seeds {config.num_seeds}",
     ]
@@ -313,6 +312,6 @@ def _command(config: RunConfig, known: Known | None = None) -> str:
     return " ".join(words)
 
 
-def cells(values: Values) -> list[str]:
+def with_every_seed(values: Values) -> list[str]:
     """Write the mean of seeds with its interval, and every seed."""
     return [with_interval(estimate(values, mean), ".2f"), " ".join(f"{value:.2f}" for value in values)]

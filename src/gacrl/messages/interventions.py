@@ -24,8 +24,12 @@ Shape: TypeAlias = Words | Float[jax.ShapeDtypeStruct, "E R N V"]
 
 
 def silence(agents: Sequence[int] | int | None = None) -> Intervention:
-    """Let nobody hear these agents (or this one), counted from 0; by default nobody hears anybody."""
+    """Let nobody hear these agents (or this one), counted from 0; by default nobody hears anybody.
+
+    Raises ConfigError for no agent, or what is no number; in play, for an agent that is not there.
+    """
     silenced = [] if agents is None else [_agent("silence", agent) for agent in np.atleast_1d(agents)]
+    require(agents is None or len(silenced) > 0, "silence: name an agent, or give no list to silence all")
 
     def init(words: Shape) -> Any:
         _require_agents("silence", silenced, words)
@@ -43,7 +47,10 @@ def silence(agents: Sequence[int] | int | None = None) -> Intervention:
 
 
 def swap(one: int, other: int) -> Intervention:
-    """Let each of the two agents be heard with the words of the other."""
+    """Let each of the two agents be heard with the words of the other.
+
+    Raises ConfigError for what is no number; in play, for an agent that is not there.
+    """
     one, other = _agent("swap", one), _agent("swap", other)
 
     def init(words: Shape) -> Any:
@@ -73,7 +80,10 @@ def scramble() -> Intervention:
 
 
 def drop(probability: float) -> Intervention:
-    """Let each edge lose what is said along it in a step, all rounds of it, with this probability."""
+    """Let each edge lose what is said along it in a step, all rounds of it, with this probability.
+
+    Raises ConfigError for what is no probability.
+    """
     probability = _share("drop", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -86,7 +96,10 @@ def drop(probability: float) -> Intervention:
 
 
 def noise(probability: float) -> Intervention:
-    """Replace each word by a symbol drawn at random with this probability."""
+    """Replace each word by a symbol drawn at random with this probability; a hidden vector by a one-hot one.
+
+    Raises ConfigError for what is no probability.
+    """
     probability = _share("noise", probability)
 
     def arrives(state: Any, ask: Ask, first: Bool[Array, " E"], key: PRNGKey) -> Arrives:
@@ -108,7 +121,11 @@ class _Late(NamedTuple):
 
 
 def delay(steps: int) -> Intervention:
-    """Let words arrive this many steps after they were said; in an episode's first steps nothing arrives."""
+    """Let words arrive this many environment steps after they were said; in an episode's first steps nothing arrives.
+
+    Where agents come and go, who takes another one's place is heard with the words of the one before. Raises
+    ConfigError for what is no number of steps from 1 to 1,000.
+    """
     steps = whole(steps, "delay")
     require(1 <= steps <= 1_000, f"delay must be a whole number of steps between 1 and 1000, not {steps}")
 

@@ -113,7 +113,8 @@ def unnamed(settings: Settings) -> Sequence[str]:
 
 
 SILENT, TOLD = "silent", "told"
-"""Among a task's references and anchors: the best policy that says nothing, and one to which everything is told."""
+"""Among a task's anchors: the best policy that says nothing, and one to which everything is told; mostly among its
+references, too."""
 MATTERS = 0.05
 """The share of a gain that counts: of what told agents gain, and of what learning gains at all."""
 HEADLINE = "return_agent_mean"
@@ -147,6 +148,10 @@ class Task(NamedTuple):
     references: Mapping[str, Callable[[Any], Any]] = MappingProxyType({})
     """Scripted policies (Environment -> Actor) beside random and noop. The first is 1 in every score, where random is
     0, and stands in the tables; the others are played by name."""
+    silent: str = SILENT
+    """Among them the best policy that says nothing, where there is one."""
+    told: str = TOLD
+    """And the best that is told everything."""
     anchors: Path | None = None
     """A JSON file of committed scores of the headline: {scores: {random, silent, told}, settings, …} and where each is
     from. The scores are those of a task with these settings."""

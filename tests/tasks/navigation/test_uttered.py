@@ -1,6 +1,7 @@
 """Symbols sent as utterance actions: they arrive a step late, as the intervention that delays them says."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +11,11 @@ from conftest import drawn
 
 from gacrl import tasks
 from gacrl.adapters import mpe2
+from gacrl.config import files as configuration
 from gacrl.config.algorithms import NetworkConfig
-from gacrl.errors import ConfigError
+from gacrl.errors import ConfigError, UserError
 from gacrl.evaluation.evaluate import evaluate
+from gacrl.experiments import scoring
 from gacrl.messages.interventions import delay, silence
 from gacrl.networks.agent import AgentNetwork
 from gacrl.tasks.navigation.environment import make
@@ -68,3 +71,12 @@ def test_what_cannot_be_uttered_is_named():
     with pytest.raises(ConfigError, match="no utterances among its actions"):
         uttered(make(tasks.default_settings("colours")), listeners(NETWORK))
     assert jnp.all(state.words == -1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"), [({"gate": True}, "may say nothing"), ({"communication": "commnet"}, "send commnet")]
+)
+def test_only_words_in_every_step_are_uttered(changes: dict[str, Any], says: str):
+    config = configuration.from_dict({"algorithm": {"network": changes}}, configuration.preset("gacrl"))
+    with pytest.raises(UserError, match=f"these agents {says}: leave --utter out"):
+        scoring._require_utterable(tasks.find("reference"), config)

@@ -17,14 +17,12 @@ from gacrl.evaluation.statistics import Estimate, estimate, mean, probability_of
 from gacrl.experiments import results, scoring
 from gacrl.experiments.results import Finals, Values, reading, why_diverged
 from gacrl.experiments.study import Planned
-from gacrl.experiments.talking.kinds import NONE, SILENT, TOLD, num_parameters
+from gacrl.experiments.talking.kinds import NONE, SILENT_KINDS, TOLD, num_parameters
 from gacrl.messages import interventions
 from gacrl.messages.bits import bits_sent
 from gacrl.networks.agent import matched
 from gacrl.replacing import replace_json
 from gacrl.tasks.task import MATTERS, Case, Task
-from gacrl.tasks.task import SILENT as SILENTLY
-from gacrl.tasks.task import TOLD as KNOWING
 
 CAUGHT: Mapping[str, str] = {"silenced": "silence", "scrambled": "scramble", "a step late": "delay 1"}
 """What happens to messages, and the intervention that does it."""
@@ -81,12 +79,14 @@ class Played:
     @property
     def floor(self) -> Best:
         """The best silent policy, scripted or trained; random where there is none."""
-        return self._best(SILENTLY, SILENT) or Best("random", self.scripted["random"][self.task.headline])
+        return self._best(self.task.silent, SILENT_KINDS) or Best(
+            "random", self.scripted["random"][self.task.headline]
+        )
 
     @property
     def ceiling(self) -> Best | None:
         """The best policy that is told everything, scripted or trained."""
-        return self._best(KNOWING, (TOLD,))
+        return self._best(self.task.told, (TOLD,))
 
     def _best(self, script: str, trained: tuple[str, ...]) -> Best | None:
         headline = self.task.headline
@@ -103,9 +103,13 @@ class Played:
         return Best(who, known[who])
 
     def scores(self, values: Values) -> Values | None:
-        """Scale the headline [S]: 0 is the floor, 1 the ceiling. None where being told is worth too little."""
-        floor, ceiling, random = self.floor, self.ceiling, self.scripted["random"][self.task.headline]
-        if ceiling is None or abs(ceiling.value - floor.value) <= MATTERS * abs(floor.value - random):
+        """Scale the headline [S]: 0 is the floor, 1 the ceiling. None where being told is not worth enough."""
+        headline = self.task.headline
+        floor, ceiling, random = self.floor, self.ceiling, self.scripted["random"][headline]
+        if ceiling is None:
+            return None
+        worth = self.task.metric(headline).sign * (ceiling.value - floor.value)
+        if worth <= MATTERS * abs(floor.value - random):
             return None
         return (values - floor.value) / (ceiling.value - floor.value)
 
@@ -118,7 +122,7 @@ class Played:
         """Return P(a seed does better than one of the better silent learner); None where one of both is missing."""
         headline = self.task.headline
         sign = self.task.metric(headline).sign
-        silent = [sign * self.learners[name].final[headline] for name in SILENT if self._ended(name)]
+        silent = [sign * self.learners[name].final[headline] for name in SILENT_KINDS if self._ended(name)]
         if not silent or not self._ended(kind):
             return None
         best = max(silent, key=lambda values: float(values.mean()))
@@ -169,23 +173,25 @@ def catch(run: Planned, say: Callable[[str], None]) -> None:
         return
     say(f"{run.name}: playing with silenced, scrambled and late messages")
     episodes = run.config.evaluation.final_episodes
-    found = {
-        how: {
-            metric: values.mean(1).tolist()
-            for metric, values in scoring.play(
-                str(run.folder), episodes, intervention=interventions.parse(words)
-            ).items()
-        }
-        for how, words in CAUGHT.items()
-    }
-    replace_json(file, found, indent=None)
+    found = {how: play(run.folder, episodes, words) for how, words in CAUGHT.items()}
+    replace_json(file, {how: _plain(final) for how, final in found.items()}, indent=None)
+
+
+def play(run: Path, episodes: int, intervention: str = "") -> dict[str, Values]:
+    """Return every metric of each seed [S], greedy, with its messages as sent or caught."""
+    played = scoring.play(str(run), episodes, intervention=interventions.parse(intervention))
+    return {metric: np.asarray(values.mean(1), float) for metric, values in played.items()}
+
+
+def _plain(final: Finals) -> dict[str, list[float]]:
+    return {metric: values.tolist() for metric, values in final.items()}
 
 
 def played(name: str, task: str, case: Case, runs: Mapping[str, Planned]) -> Played:
     """Read what the finished learners of a case came to. runs: by kind."""
     found = tasks.find(task)
     config = next(iter(runs.values())).config
-    scripted = [who for who in ("random", SILENTLY, KNOWING) if who in references.playable(found)]
+    scripted = [who for who in ("random", found.silent, found.told) if who in references.playable(found)]
     episodes, env = config.evaluation.final_episodes, runs[NONE].config.env if NONE in runs else config.env
     return Played(
         name=name,

@@ -24,8 +24,10 @@ from gacrl.networks.communication.symbols import Symbols
 from gacrl.tasks.task import Case
 
 NONE, REMEMBERING, TOLD, SYMBOLS, UTTERED = "none", "none-recurrent", "told", "discrete", "actions"
-SILENT = (NONE, REMEMBERING)
+SILENT_KINDS = (NONE, REMEMBERING)
 """Who says nothing: the better one is the floor of a score."""
+KIND_OF: Mapping[str, str] = MappingProxyType({"silent": NONE, "talking": SYMBOLS, "told": TOLD})
+"""Of the three learners that answer for one task."""
 EVALUATIONS = 16
 CLOSING_EPISODES = 512
 """Whatever is compared at the end plays as many."""
@@ -72,6 +74,11 @@ def talker(config: RunConfig, seeds: int, env_steps: int, interval: int) -> RunC
         )
     if tasks.find(config.task).make(config.env).num_agents < 2:
         raise UserError(f"{config.task} has a single agent: nobody is there to talk to")
+    if getattr(config.env, "talk", None) == "actions":
+        raise UserError(
+            f"{config.task} has words among its actions there, and no messages that could be silenced: leave "
+            "--env.talk out"
+        )
     changes = {
         "num_seeds": seeds,
         "algorithm": {"network": {"communication": SYMBOLS}},
@@ -160,7 +167,7 @@ def learns_by(preset: str, shared: Base, times: int = 1) -> RunConfig:
     )
 
 
-_OTHERS: Mapping[str, str] = MappingProxyType(
+_MESSAGES: Mapping[str, str] = MappingProxyType(
     {
         NONE: "nobody hears anybody",
         TOLD: "all that the speaker sees",
@@ -176,7 +183,7 @@ _OTHERS: Mapping[str, str] = MappingProxyType(
 
 def kinds() -> dict[str, Kind]:
     """List the learners of the study, by name; kinds of messages that were added among them."""
-    found = {name: Kind(says, partial(sends, name)) for name, says in _OTHERS.items()}
+    found = {name: Kind(says, partial(sends, name)) for name, says in _MESSAGES.items()}
     own = {name: Kind("messages of your own", partial(sends, name)) for name in COMMUNICATION if name not in found}
     return {
         NONE: found.pop(NONE),

@@ -12,10 +12,10 @@ from gacrl import tasks
 from gacrl.config import files as configuration
 from gacrl.config.run import RunConfig
 from gacrl.errors import UserError, reason
-from gacrl.experiments.talking import kinds
+from gacrl.experiments.talking.kinds import KIND_OF
 from gacrl.tasks.task import HEADLINE
 
-_IN_A_STUDY = {"silent": kinds.NONE, "told": kinds.TOLD}
+_WHO = ("silent", "told")
 
 
 class Known(NamedTuple):
@@ -45,7 +45,7 @@ def read(file: Path, config: RunConfig) -> Known:
         raise UserError(
             f"cannot read {file}: {reason(error)}; --known takes a summary.json of gacrl talk"
         ) from error
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise UserError(f"{file} is no summary.json of gacrl talk: leave --known out") from error
     raise UserError(
         f"{file} has no silent and told learners of {config.task} with these settings and "
@@ -62,14 +62,15 @@ def _plays(study: Mapping[str, Any]) -> tuple[Any, int]:
 def _known(file: Path, study: Mapping[str, Any], config: RunConfig) -> Known:
     task = tasks.find(config.task)
     if "kinds" in study:
-        finals = {who: study["kinds"][kind]["final"] for who, kind in _IN_A_STUDY.items()}
-        parameters = {who: int(study["kinds"][kind]["parameters"]) for who, kind in _IN_A_STUDY.items()}
+        cells = {who: study["kinds"][KIND_OF[who]] for who in _WHO}
+        finals = {who: cell["final"] for who, cell in cells.items()}
+        parameters = {who: int(cell["parameters"]) for who, cell in cells.items()}
     else:
         metrics = {label: metric for metric, label in task.shown([HEADLINE, *task.metrics]).items()}
-        further = {metrics[label]: by_who for label, by_who in study["further"].items()}
+        further = {metrics.get(str(label), str(label)): by_who for label, by_who in study["further"].items()}
         measured = {HEADLINE: study["returns"], **further}
-        finals = {who: {metric: by_who[who] for metric, by_who in measured.items()} for who in _IN_A_STUDY}
-        parameters = {who: int(study["parameters"][who]) for who in _IN_A_STUDY}
+        finals = {who: {metric: by_who[who] for metric, by_who in measured.items()} for who in _WHO}
+        parameters = {who: int(study["parameters"][who]) for who in _WHO}
     seeds, episodes = len(finals["silent"][HEADLINE]), study["config"]["evaluation"]["final_episodes"]
     return Known(
         file=file,

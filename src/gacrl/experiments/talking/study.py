@@ -3,6 +3,7 @@
 A cell that is done is not run again, whichever tasks and kinds are asked for: the report shows all that are there.
 """
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,16 @@ from gacrl.training.recorder import RunFolder
 
 EPISODES = 320
 """Of the evaluations along the way."""
+
+
+class Asked(NamedTuple):
+    """What all learners of a study share, as `study` has it."""
+
+    config: RunConfig
+    seeds: int
+    scale: float
+    trials: int
+    use: Sequence[Path]
 
 
 class Cell(NamedTuple):
@@ -72,14 +83,15 @@ def study(
     cases: Sequence[str] = (),
     kinds: Sequence[str] = (),
     watch: Watch | None = None,
+    use: Sequence[Path] = (),
 ) -> Study | None:
     """Train and play what is missing under `out`, and write `report.html`, `report.md` and `summary.json` there.
 
-    config: of the learner, whatever its task is. scale: of the steps. trials: learning rates that every learner may try
-    on seeds of their own; 1: as the presets are. cases, kinds: those to train; none: all. Silent and told learners are
-    always among them. Returns None where the watcher's stop ended it early. Raises UserError for
-    fewer than two seeds, a case or kind there is not, a preset whose agents cannot talk, or a folder that holds
-    something else.
+    config: of the learner, whatever its task is. seeds: of each. scale: of the steps. trials: learning rates that every
+    learner may try on seeds of their own; 1: as the presets are. cases, kinds: those to train; none: all. Silent and
+    told learners are always among them. use: files that added kinds, for the command in the report. Returns None where
+    the watcher's stop ended it early. Raises UserError for fewer than two seeds, a case or kind there is not, a preset
+    whose agents cannot talk, or a folder that holds something else.
     """
     watch, out = watch or Watch(), out.absolute()
     if seeds < 2:
@@ -101,18 +113,22 @@ def study(
         if not _train(cell.run, attempts[cell.run.name], watch):
             return None
     watch.say("writing the report")
-    ended = [cell for cell in cells if cell.run.finished]
+    done = _written(Asked(config, seeds, scale, trials, use), out, [cell for cell in cells if cell.run.finished])
+    replace_json(out / "summary.json", done.to_dict(), indent=1)
+    return done
+
+
+def _written(asked: Asked, out: Path, ended: Sequence[Cell]) -> Study:
+    """Write the report of all finished cells."""
     found = {
         name: played(
             name, *all_cases()[name], {cell.kind: _as_it_was(cell.run) for cell in ended if cell.case == name}
         )
         for name in dict.fromkeys(cell.case for cell in ended)
     }
-    command, made = _command(config, seeds, scale, trials, found), made_by(cell.run.folder for cell in ended)
-    page = report.page(found, config, seeds, trials, command, made)
-    done = Study(out, page.write(out, "report"), command, found, made)
-    replace_json(out / "summary.json", done.to_dict(), indent=1)
-    return done
+    command, made = _command(asked, found), made_by(cell.run.folder for cell in ended)
+    page = report.page(found, asked.config, asked.seeds, asked.trials, command, made)
+    return Study(out, page.write(out, "report"), command, found, made)
 
 
 def _train(run: Planned, trials: Sequence[Planned], watch: Watch) -> bool:
@@ -155,12 +171,13 @@ def _known(what: str, asked: Sequence[str], known: list[str]) -> list[str]:
     return list(asked) or known
 
 
-def _command(config: RunConfig, seeds: int, scale: float, trials: int, cases: Mapping[str, Played]) -> str:
+def _command(asked: Asked, cases: Mapping[str, Played]) -> str:
     """Write what makes these cells anew."""
-    words = [f"gacrl talk --preset {config.preset} --seeds {seeds} --seed {config.seed}"]
-    words += [f"--scale {scale:g}"] if scale != 1 else []
-    words += [f"--trials {trials}"] if trials > 1 else []
+    words = [f"gacrl talk --preset {asked.config.preset} --seeds {asked.seeds} --seed {asked.config.seed}"]
+    words += [f"--scale {asked.scale:g}"] if asked.scale != 1 else []
+    words += [f"--trials {asked.trials}"] if asked.trials > 1 else []
     some_kinds = report.kinds_in(cases)
     words += [f"--tasks {' '.join(cases)}"] if len(cases) < len(all_cases()) else []
     words += [f"--kinds {' '.join(some_kinds)}"] if len(some_kinds) < len(talkers.kinds()) else []
+    words += [f"--use {shlex.quote(str(file))}" for file in asked.use]
     return " ".join(words)

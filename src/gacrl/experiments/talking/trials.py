@@ -14,12 +14,13 @@ from gacrl.training.recorder import RunFolder
 FACTORS = (1.0, 1 / 3, 3.0, 1 / 9, 9.0)
 """Of the learning rate that the preset has, in the order in which they are tried."""
 _SEEDS = (1_000, 2)
-"""The first seed of a trial, and how many: no result is of these."""
+"""How far from the learner's own a trial's seeds begin, and how many: no result is of these."""
 
 
 def tried(run: Planned, trials: int) -> list[Planned]:
     """Plan the trials of a learner, each for as many steps as the learner itself."""
-    first, many = _SEEDS
+    beyond, many = _SEEDS
+    first = run.config.seed + max(beyond, run.config.num_seeds)
     return [
         Planned(
             f"{run.name}, trial {number} of {trials}",

@@ -38,6 +38,8 @@ TASK = Task(
     # random actions high, and they never show what a car meets where the others drive well.
     progress=None,
     references={"yielder": yielder, "gas": gas},
+    silent="gas",
+    told="yielder",
     anchors=Path(__file__).with_name("anchors.json"),
     # Where all cars are and where they go says all that can be known of the next step.
     needs_memory=False,
