@@ -101,15 +101,15 @@ def study(
     wanted = {*_known("task of the study", cases, list(all_cases()))}
     hearing = {*_known("kind of communication", kinds, list(talkers.kinds())), talkers.NONE, talkers.TOLD}
     cells = plan(config, out, seeds, scale)
-    asked = [cell for cell in cells if cell.case in wanted and cell.kind in hearing]
+    chosen = [cell for cell in cells if cell.case in wanted and cell.kind in hearing]
     marker = {"config": configuration.to_dict(replace(config, num_seeds=seeds)), "scale": scale, "trials": trials}
     claim_folder(out, "study.json", marker, "study of talk", lambda held: "another study: choose another --out")
-    attempts = {cell.run.name: tried(cell.run, trials) if trials > 1 else [] for cell in asked}
+    attempts = {cell.run.name: tried(cell.run, trials) if trials > 1 else [] for cell in chosen}
     if trials == 1:  # else what a learner's rate is to be is not known yet
         refuse_other_settings([cell.run for cell in cells])
     says = {kind: found.says for kind, found in talkers.kinds().items()}
-    watch.planned({run.name: says[cell.kind] for cell in asked for run in (*attempts[cell.run.name], cell.run)})
-    for cell in asked:
+    watch.planned({run.name: says[cell.kind] for cell in chosen for run in (*attempts[cell.run.name], cell.run)})
+    for cell in chosen:
         if not _train(cell.run, attempts[cell.run.name], watch):
             return None
     watch.say("writing the report")
