@@ -151,7 +151,7 @@ def of_cell(case: str, kind: str, what: str) -> Numbers:
     """
 
     def found() -> tuple[float, ...]:
-        cell = data("talk-study")["cases"][case]["kinds"].get(kind)
+        cell = data(STUDIED.get(case, "talk-study"))["cases"][case]["kinds"].get(kind)
         if cell is None or what != "steps":
             return () if cell is None or cell[what] is None else tuple(np.atleast_1d(cell[what]))
         came = [steps for steps in cell["steps_to_.9"] if steps is not None]
@@ -220,6 +220,13 @@ BASELINES = ("mappo", "ippo", "vdn", "qmix")
 SCRIPTED = {"random": "random", "doing nothing": "noop", "oracle": "oracle"}
 ANCHORED = ("speaker_listener", "reference", "colours")
 TALKED = (*ANCHORED, "colours-full", "colours-unnamed")
+STUDIED = {
+    "scouts": "talk-study-more",
+    "colours-full": "talk-study-more",
+    "colours-unnamed": "talk-study-more",
+    "traffic_junction": "talk-study-traffic",
+}
+"""Cases of the study of kinds that were trained later, and their files."""
 TALK_ROWS = {
     "speaker_listener": "talk-speaker_listener-10-seeds",
     "reference": "talk-reference-10-seeds",
@@ -238,6 +245,9 @@ MEDIUM = {
     "a horizon of γ .9": "talk-traffic-medium-short-horizon-3-seeds",
     "its words silenced": "talk-traffic-medium-short-horizon-silenced",
     "its words scrambled": "talk-traffic-medium-short-horizon-scrambled",
+    "64 units": "talk-traffic-medium-64-units-3-seeds",
+    "their words silenced": "talk-traffic-medium-64-units-silenced",
+    "their words scrambled": "talk-traffic-medium-64-units-scrambled",
 }
 TRAFFIC = {
     "the team's reward shared": "talk-traffic-easy-shared-3-seeds",
@@ -408,6 +418,10 @@ TABLES: Mapping[tuple[str, str, int], Rules] = {
             1: of_cell("reference", kind, "bits"),
             **{column: of_cell(case, kind, what) for column, (case, what) in enumerate(product(ANCHORED, ("score", "steps")), 2)},
         }
+        for kind in kinds()
+    },
+    (RESULTS, "Kinds of communication", 1): {
+        kind: {column: of_cell(case, kind, what) for column, (case, what) in enumerate(product(STUDIED, ("score", "steps")), 1)}
         for kind in kinds()
     },
     (RESULTS, "What each part is worth", 0): parts("ablation", COVERED, RETURN, TOUCHED),
