@@ -72,7 +72,7 @@ def kinds_in(cases: Mapping[str, Played]) -> list[str]:
 
 def _case(made: Page, case: Played) -> None:
     """Add a task: who learned what, what their messages did, and curves."""
-    headline, reached = case.task.headline, case.case.reached
+    shown = _shown(case)
     made.heading(case.name)
     made.text(_says(case))
     says = kinds()
@@ -84,11 +84,11 @@ def _case(made: Page, case: Played) -> None:
             f"{ended.parameters:,}",
             "" if ended.bits is None else f"{ended.bits:.0f}",
             *_results(case, ended),
-            _steps(ended.steps_to(reached)),
+            _steps(ended.steps_to(case.case.reached)),
         ]
         for kind, ended in case.learners.items()
     ]
-    columns = ("", "what agents hear", "steps", "parameters", "bits", "score", headline, reached, "every seed")
+    columns = ("", "what agents hear", "steps", "parameters", "bits", "score", *shown, "every seed")
     made.table((*columns, f"steps to {REACHED:g}"), rows)
     caught = {kind: ended for kind, ended in case.learners.items() if ended.caught}
     if caught:
@@ -138,10 +138,15 @@ def _says(case: Played) -> str:
 def _results(case: Played, ended: Ended) -> list[str]:
     """Write score, headline and what is to be reached, and every seed of the last."""
     if not ended.final:
-        return [f"diverged: {ended.diverged}", "", "", ""]
-    reached = ended.final[case.case.reached]
-    cells = [with_interval(estimate(values, mean), ".2f") for values in (ended.final[case.task.headline], reached)]
-    return [_score(case, ended), *cells, " ".join(f"{value:.2f}" for value in reached)]
+        return [f"diverged: {ended.diverged}", *[""] * len(_shown(case)), ""]
+    cells = [with_interval(estimate(ended.final[metric], mean), ".2f") for metric in _shown(case)]
+    seeds = " ".join(f"{value:.2f}" for value in ended.final[case.case.reached])
+    return [_score(case, ended), *cells, seeds]
+
+
+def _shown(case: Played) -> list[str]:
+    """Return the headline and what is to be reached: one, where they are the same."""
+    return list(dict.fromkeys((case.task.headline, case.case.reached)))
 
 
 def _score(case: Played, ended: Ended | None) -> str:
