@@ -322,7 +322,8 @@ def heat(
                 if np.isfinite(value):
                     dark = value < (low + high) / 2
                     color = "white" if dark else "black"
-                    axes.text(j, i, f"{value:.3g}", ha="center", va="center", color=color, fontsize=10)
+                    written = value if abs(value) > 1e-9 * (high - low) else 0.0  # what rounding leaves of nothing
+                    axes.text(j, i, f"{written:.3g}", ha="center", va="center", color=color, fontsize=10)
             axes.set_title(literal(f"{panels[0]} {name}"))
             axes.set_xticks(range(shape[2]), _literals(columns[1]))
             axes.set_yticks(range(shape[1]), _literals(rows[1]))
