@@ -58,7 +58,7 @@ class ValueNorm(NamedTuple):
 
 
 class RewardNorm(NamedTuple):
-    """Rewards in a unit of their own, and around 0 where that leaves the optimum as it is."""
+    """Give rewards a unit of their own, around 0 where that leaves the optimum as it is."""
 
     moments: ValueNorm
     ended: Bool[Array, ""]

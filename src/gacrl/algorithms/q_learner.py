@@ -46,7 +46,7 @@ def message_loss(output: AgentOutput, observation: Observation) -> Metrics:
 
 
 class Parts(NamedTuple):
-    """What makes a learner out of Q-learning (`q_learning.make`)."""
+    """Hold what makes a learner out of Q-learning (`q_learning.make`)."""
 
     networks: Callable[[PRNGKey], Network]
     team_value: TeamValue
@@ -58,7 +58,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """What is settled before anything is learned: constants of every function of Q-learning."""
+    """Hold what is settled before anything is learned: constants of every function of Q-learning."""
 
     config: QLearningConfig
     env: Environment

@@ -29,7 +29,7 @@ EPISODES = 320
 
 
 class Asked(NamedTuple):
-    """What all learners of a study share, as `study` has it."""
+    """Hold what all learners of a study share: the arguments of `study`."""
 
     config: RunConfig
     seeds: int
