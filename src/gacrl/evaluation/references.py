@@ -14,7 +14,7 @@ from gacrl.envs.environment import Environment, EnvParams
 from gacrl.errors import ConfigError
 from gacrl.evaluation.episodes import Look
 from gacrl.evaluation.evaluate import evaluate, stream_key
-from gacrl.tasks.task import Task
+from gacrl.tasks.task import SILENT, Task
 from gacrl.types import Actor, Decision, Memory, Observation, PRNGKey
 
 FLOORS = ("random", "noop")
@@ -52,7 +52,7 @@ def playable(task: Task) -> list[str]:
 
 def shown(task: Task) -> list[str]:
     """Return those that stand beside every number: the floors, the first of the task's own, and the silent one."""
-    own = [name for i, name in enumerate(task.references) if i == 0 or name == task.silent]
+    own = [name for i, name in enumerate(task.references) if i == 0 or name == SILENT]
     return [*FLOORS, *own]
 
 
